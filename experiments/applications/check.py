@@ -1,4 +1,4 @@
-"""Whether a model responds to each action dimension of a robot's recordings, with the sign and scale they have."""
+"""Whether a model responds to each action dimension of a robot's recordings, with the recorded sign and scale."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from hma_jax.training.runs import Model
 
 BATCH = 16
 AT_LEAST = 8
-"""The `store.min_val` that is advised where there are enough episodes."""
+"""The `store.min_val` that is advised if there are enough episodes."""
 
 
 def open_study(workspace: Workspace) -> PreparedData:
-    """Tokenizer, tokens and windows of a study. Raises ConfigError where they are not there."""
+    """Tokenizer, tokens and windows of a study. Raises ConfigError if they do not exist."""
     needed = (workspace.store, workspace.tokenizer, workspace.manifest)
     missing = [str(path) for path in needed if not path.exists()]
     require(not missing, f"{', '.join(missing)}: not found; give the --out of a study that has tokens of the robots")
@@ -42,10 +42,10 @@ def open_study(workspace: Workspace) -> PreparedData:
 def choose_robots(
     run: Path, model: Model, prepared: PreparedData, robots: Sequence[str], windows: int, out: Path
 ) -> tuple[list[str], dict[str, str]]:
-    """(the robots to check, {another one: why it has too few episodes}) of `robots`, by default of all that the study
-    in `out` has windows of.
+    """(the robots to check, {robot left out: why it has too few episodes}) among `robots`, by default among all robots
+    with windows in the study in `out`.
 
-    Raises ConfigError where the study does not know a robot, or none is left.
+    Raises ConfigError if the study does not know a robot, or none is left.
     """
     store, manifest = prepared.store, prepared.manifest
     frozen = [d.dataset for d in manifest.datasets]
@@ -70,14 +70,14 @@ def check_run(
     robots: Sequence[str],
     windows: int,
 ) -> dict[str, list[Effect]]:
-    """Effects of each robot's dimensions, on so many held-out windows of each."""
+    """Effects of each robot's dimensions, on this number of held-out windows of each."""
     known = {r.name: r for r in find_robots(run, model.table)}
     loss = jax.jit(make_loss(model.config, model.table, model.run.train.masking.setting, model.execution))
     return {name: _check(model, loss, prepared.store, prepared.manifest, known[name], windows) for name in robots}
 
 
 def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> str | None:
-    """Why `windows` windows of a robot are of fewer than MIN_EPISODES episodes, and what to do; None if they are
+    """Why `windows` windows of a robot come from fewer than MIN_EPISODES episodes, and what to do; None if they do
     not."""
     (frozen,) = (d.windows for d in manifest.datasets if d.dataset == robot)
     judged, of_all = (len({episode for episode, _ in some}) for some in (subsample_windows(frozen, windows), frozen))
@@ -110,7 +110,7 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
 
 
 def _hold_out_more(settings: JobSettings, counts: Sequence[int]) -> str:
-    """How to have MIN_EPISODES held out, of a dataset with so many in each of its parts."""
+    """How to hold out MIN_EPISODES, for a dataset with `counts` episodes in its parts."""
     episodes = sum(counts)
     for share, more in ((settings.max_val_fraction, ""), (0.5, " --set store.max_val_fraction=0.5")):
         more_held_out = HeldOut(settings.val_fraction, AT_LEAST, max(AT_LEAST, settings.max_val), share)

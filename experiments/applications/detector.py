@@ -6,10 +6,9 @@ Expected: it finds tools and visible objects of held-out true frames within 2 pi
           also as the run's tokenizer shows them.
 
 The suite gives the true positions. Half of the training frames are reconstructions by RUN's tokenizer, and in some an
-object is missing, so that absence is learnt, too. It sees frames of 64 pixels; those of a run that has fewer are
-enlarged.
-Writes detector.npz (half precision) and errors.csv, its errors on held-out episodes. The same command goes on where
-it was stopped (its frames are drawn again, in a minute or two), and keeps a detector that is there.
+object is missing, so that absence is learnt too. It sees frames of 64 pixels; smaller frames of a run are enlarged.
+Writes detector.npz (half precision) and errors.csv, its errors on held-out episodes. The same command continues where
+it was stopped (its frames are drawn again, in a minute or two), and keeps an existing detector.
 """
 
 from __future__ import annotations
@@ -48,8 +47,8 @@ COMMITTED, OUT = Path("experiments/results/detector"), Path("runs/detector")
 WEIGHTS, ERRORS = "detector.npz", "errors.csv"
 UNFINISHED = f"{WEIGHTS}.unfinished"
 EPISODES, MIN_EPISODES, PER_EPISODE, HELD_OUT = 1920, 48, 16, (24, 16)
-"""Training episodes of all robots together, at least so many of each robot, frames per episode; held-out episodes of
-each robot and their frames."""
+"""Training episodes of all robots together, the least number for each robot, and frames per episode; held-out episodes
+of each robot and their frames."""
 
 STEPS, STEPS_PER_ROBOT, BATCH, LEARNING_RATE = 1000, 125, 32, 2e-3
 """Training steps: so many, and more for each robot."""
@@ -62,8 +61,8 @@ MAX_NOISE = 16.0
 """Standard deviation, in grey levels, of the strongest noise added to training frames."""
 
 MIN_CONFIDENCE, SURE_CONFIDENCE = 0.15, 0.5
-"""Confidence above which a point counts as detected, and above which tables of films also count it, since how much is
-found depends on this threshold."""
+"""Confidence above which a point counts as detected, and a second threshold for which tables of films also count
+points, since the number found depends on the threshold."""
 
 WITHIN_PX = (2.0, 4.0)
 """Distances, in pixels of a 64-pixel frame, within which the share of detections is reported."""
@@ -76,8 +75,8 @@ BLOCK = 64
 
 
 def in_blocks(call: Callable[[np.ndarray], Any], frames: np.ndarray) -> Any:
-    """What `call` gives for frames [n, ...], arrays [n, ...]. It is called with BLOCK frames at a time, so that one
-    program is compiled."""
+    """What `call` returns for frames [n, ...]: arrays [n, ...]. It is called with BLOCK frames at a time, so that only
+    one program is compiled."""
     filled = np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % BLOCK, 0)])
     parts = [call(filled[i : i + BLOCK]) for i in range(0, len(filled), BLOCK)]
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(frames)], *parts)
@@ -91,7 +90,8 @@ class Detector:
         self._detect = jax.jit(detect)
 
     def detect(self, robot: str, frames: np.ndarray) -> Detections:
-        """The robot's P points in frames uint8 [n, H, W, 3]. Raises ConfigError for one it was not trained on."""
+        """The robot's P points in frames uint8 [n, H, W, 3]. Raises ConfigError for a robot on which it was not
+        trained."""
         require(robot in self.robots, f"the detector was not trained on {robot}; it knows {', '.join(self.robots)}")
         index, count = self.robots.index(robot), len(point_names(SPECS[robot]))
         found = in_blocks(lambda block: self._detect(self.weights, block, index), frames)
@@ -103,7 +103,7 @@ class Detector:
 
     @classmethod
     def load(cls, path: Path) -> Detector:
-        """Raises ConfigError where there is none."""
+        """Loads a detector. Raises ConfigError if there is none."""
         advice = "train a detector with python -m experiments.applications.detector RUN"
         with reading_arrays(path, advice) as arrays:
             weights = {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items() if name != "robots"}
@@ -111,7 +111,7 @@ class Detector:
 
 
 def batches(scenes: Sequence[Scenes], rng: np.random.Generator, size: int) -> Iterator[tuple]:
-    """What `points_loss` takes, of random frames of random robots, with noise; without end."""
+    """Endless batches for `points_loss`, of random frames of random robots, with noise."""
     points, side = max(own.points.share.shape[-1] for own in scenes), scenes[0].images.shape[1]
     while True:
         images, robots = np.zeros((size, side, side, 3), np.float32), rng.integers(len(scenes), size=size)
@@ -162,7 +162,7 @@ def train_detector(
 
 
 def _save_progress(path: Path, done: int, trained: Any, rng: np.random.Generator) -> None:
-    """Writes all that the steps after the first `done` depend on, besides the scenes."""
+    """Writes everything, besides the scenes, that the steps after the first `done` depend on."""
     leaves = {f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(trained))}
     write_arrays(path, {"done": done, "rng": json.dumps(rng.bit_generator.state)} | leaves, compressed=False)
 
@@ -177,8 +177,9 @@ def _resume(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]
 
 
 def detection_errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, object]]:
-    """Position errors for each kind of point of a robot, detection rates, and which share of points that are not
-    visible is detected nevertheless (`ghosts`) and how many these points are, by why they are not: see `unseen`."""
+    """Position errors for each kind of point of a robot, detection rates, and, for points that are not visible, the
+    share that is detected nevertheless (`ghosts`) and their number, by the reason why they are not visible (see
+    `unseen`)."""
     points, (position, confidence) = scenes.points, detector.detect(robot, scenes.images)
     error = np.linalg.norm(position - points.position, axis=-1)
     names, rows = point_names(SPECS[robot]), []
@@ -201,8 +202,8 @@ def detection_errors(detector: Detector, robot: str, scenes: Scenes) -> list[dic
 
 
 def unseen(points: Points) -> dict[str, np.ndarray]:
-    """Points that are not visible, bool [n, P] for each reason: `absent`, no object has this colour; `hidden`, none of
-    it is in view; `partly`, too little is."""
+    """Points that are not visible, bool [n, P] for each reason: `absent`, no object has this colour; `hidden`, no part
+    of it is in view; `partly`, too little of it is in view."""
     there = ~points.absent
     return {
         "absent": points.absent,
@@ -272,7 +273,7 @@ def make_detector(robots: Sequence[str], tokenizer: Tokenizer, out: Path) -> Det
         for frames, given in (("true", resized), ("tokenizer", reconstructed)):
             rows += [{"frames_of": frames} | row for row in detection_errors(detector, name, given(tokenizer, scenes))]
     write_rows(out / ERRORS, rows)
-    aside.replace(out / WEIGHTS)  # last: where the weights exist, errors.csv does
+    aside.replace(out / WEIGHTS)  # written last: if the weights exist, errors.csv does too
     unfinished.unlink(missing_ok=True)
     return detector
 

@@ -20,7 +20,7 @@ HEAT_STD = 1.0
 """Standard deviation of a point's target heat, in cells."""
 
 PEAK_RADIUS = 2
-"""Cells on each side of the peak that its position is averaged over."""
+"""Number of cells on each side of the peak over which its position is averaged."""
 
 LAYERS = {
     "half": (4, 3, 16), "half2": (3, 16, 24), "quarter": (3, 24, 32), "quarter2": (3, 32, 32), "eighth": (3, 32, 64),
@@ -39,7 +39,7 @@ class Detections(NamedTuple):
 
 
 def init_detector(key: jax.Array, robots: int, points: int) -> DetectorParams:
-    """For `robots` robots of at most `points` points, and frames whose sides are multiples of 8 pixels."""
+    """Weights for `robots` robots with at most `points` points, and frames whose sides are multiples of 8 pixels."""
     shapes = {name: (side, side, a, b) for name, (side, a, b) in LAYERS.items()}
     shapes["heads"] = (robots, LAYERS["merge_half"][2], points)
     weights = {}

@@ -1,13 +1,13 @@
-"""Question: at the end of a window, do robots and objects stand where they truly would?
+"""Question: at the end of a window, are robots and objects where they truly would be?
 Command: python -m experiments.applications.in_place RUN --out DIR [--robots NAME ...]
 Cost: half an hour of one core for forty robots, most of it the detector, which is made once.
-Expected: what moved is found within 2 pixels of 32 of its true place in most last frames of a model that follows
-          actions, in nearly none of a still picture.
+Expected: things that moved are found within 2 pixels (of 32) of their true place in most last frames of a model that
+          follows actions, and in almost none of a still picture.
 
-Held-out episodes of every robot that the suite can simulate go on from a prompt of `START_FRAMES` frames to the end
-of the model's window, under the recorded actions, in the learned and in the true simulator. Blur costs little PSNR
-but much of this share. Writes DIR/in_place.csv, a row for each thing that is seen at the end, and the detector, if it
-is not there yet.
+Held-out episodes of every robot that the suite can simulate continue from a prompt of `START_FRAMES` frames to the end
+of the model's window, under the recorded actions, in the learned and in the true simulator. Blur costs little PSNR but
+much of this share. Writes DIR/in_place.csv, a row for each thing that is seen at the end, and the detector, if it does
+not exist yet.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ from hma_jax.simulator.simulator import Simulator
 EPISODES = 8
 TABLE = "in_place.csv"
 VIEWS = ("model", "true", "tokens", "still")
-"""The last frames that the detector is applied to: the model's; the true one (misses there are the detector's own
-error); the true one reconstructed by the tokenizer (an upper bound for a model of its tokens); and the last one of the
-prompt, which is what copying gives."""
+"""The last frames to which the detector is applied: the model's; the true one (misses there are the detector's own
+error); the true one reconstructed by the tokenizer (an upper bound for a model of its tokens); and the last frame of
+the prompt, which is what copying gives."""
 
 
 def measure_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[Row]:
-    """A row for each point of a robot that is visible in the true last frame; [] where its episodes are too short.
+    """A row for each point of a robot that is visible in the true last frame; [] if its episodes are too short.
 
     `simulator` has `EPISODES` episodes.
     """
@@ -93,7 +93,7 @@ def _points(true: TrueSimulator, robot: Robot, episodes: int) -> Points:
 
 
 def in_place(rows: Sequence[Row], view: str) -> tuple[float, float, int]:
-    """(share, half-width of its 95 % interval, robots): of the points that moved by more than `CLOSE_PX`, how many are
+    """(share, half-width of its 95 % interval, robots): the share of points that moved by more than `CLOSE_PX` and are
     detected within that distance of their true position; averaged by robot, then over robots (Student's t)."""
     near = [
         {
@@ -101,7 +101,7 @@ def in_place(rows: Sequence[Row], view: str) -> tuple[float, float, int]:
             "near": float(row[f"{view}_px"]) <= CLOSE_PX and float(row[f"{view}_confidence"]) >= MIN_CONFIDENCE,
         }
         for row in rows
-        if float(row["moved_px"]) > CLOSE_PX  # not of what came into view
+        if float(row["moved_px"]) > CLOSE_PX  # not for things that came into view
     ]
     return over_robots(near, "near")
 
@@ -116,7 +116,7 @@ def main() -> None:
     simulator = load_simulator(args.run, **options)
     robots, weights = select_robots(suite_robots(simulator.robots), args.robots), args.out / WEIGHTS
     settings = {"robots": sorted(robots)} if args.robots else {}
-    pin_settings(args.out, args.run, simulator, settings)  # a detector knows frames as one tokenizer shows them
+    pin_settings(args.out, args.run, simulator, settings)  # a detector is trained on frames as one tokenizer shows them
     if not weights.exists():
         make_detector(list(robots), simulator.tokenizer, args.out)
     detector, rows, short = Detector.load(weights), [], []

@@ -3,16 +3,16 @@
 Question: how good is the model's own action head in closed loop, in the true simulator and past its window?
 Paper: paper section 3.1, policies as one of the settings that the model is trained in.
 Command: python -m experiments.applications.own_policy
-Cost: forty minutes of one core; goes on where it was stopped.
-Expected: well above random actions; no better than policies made for nothing else.
+Cost: forty minutes of one core; continues where it was stopped.
+Expected: well above random actions; no better than policies that are made only for this task.
 
-The world model gets action heads and is post-trained, all of it, to predict what an expert does next
-(`masking.setting` is policy). The others are trained on the same episodes. All begin at the same starts, which no
-recording has. `--policies` takes some of them; with `--predicts chunk` the Diffusion Policy predicts the clean chunk of
-actions instead of the noise in it, with `--limits spread` it gives no action beyond three standard deviations.
+The world model gets action heads and is post-trained, all of it, to predict what an expert does next (`masking.setting`
+is policy). The others are trained on the same episodes. All begin at the same starts, which are in no recording.
+`--policies` takes some of them; with `--predicts chunk` the Diffusion Policy predicts the clean chunk of actions
+instead of the noise in it, with `--limits spread` it gives no action beyond three standard deviations.
 
 Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md, success with intervals over starts;
-run, the post-trained model, and its tokenizer: a policy, and no simulator any more.
+run, the post-trained model, and its tokenizer: a policy, no longer a simulator.
 """
 
 from __future__ import annotations
@@ -69,19 +69,19 @@ NAMES = ("policy", "start", "success", "distance")
 
 @dataclass(frozen=True)
 class Settings:
-    """All that the results depend on besides the world model."""
+    """Everything that the results depend on besides the world model."""
 
     robot: str = "pusher_sand"
     task: str = "reach"
-    frames: int = 20  # of an episode: more than the model's window
+    frames: int = 20  # frames of an episode: more than the model's window
     hold: int = 4
     demonstrations: int = 1500
-    noise: float = 0.1  # of the expert
+    noise: float = 0.1  # noise of the expert
     starts: int = 100
-    steps: int = 3000  # of training, of every policy
+    steps: int = 3000  # steps of training, for every policy
     batch: int = 12  # windows of the model
     learning_rate: float = 1e-3
-    predicts: Predicts = later("noise")  # of the Diffusion Policy, as the next
+    predicts: Predicts = later("noise")  # of the Diffusion Policy, like the next
     limits: Limits = later("range", before="spread")
     seed: int = 0
 
@@ -129,7 +129,7 @@ def with_heads(model: Model, seed: int) -> tuple[Params, ModelConfig]:
 def post_train(
     simulator: Simulator, robot: Robot, demos: Demonstrations, settings: Settings, run: Path, report: Report
 ) -> Model:
-    """The world model as a policy, trained or trained on in `run`, with its tokenizer beside it."""
+    """The world model as a policy, trained or further trained in `run`, with its tokenizer beside it."""
     model, tokenizer = simulator.model, simulator.tokenizer
     flat = demos.images.reshape(-1, *demos.images.shape[2:])
     tokens = np.concatenate([np.asarray(tokenizer.encode(flat[i : i + 256])) for i in range(0, len(flat), 256)])
@@ -177,7 +177,7 @@ def read_trials(path: Path) -> dict[str, list[tuple[bool, float]]]:
 
 
 def summarise(trials: Mapping[str, list[tuple[bool, float]]]) -> list[tuple[str, float, float, float]]:
-    """(policy, success, its interval of 95 %) over starts."""
+    """(policy, success, its 95 % interval) over starts."""
     rates = {name: rate_interval(np.array([success for success, _ in ends])) for name, ends in trials.items()}
     return [(name, rate.mean, rate.low, rate.high) for name, rate in rates.items()]
 
@@ -192,9 +192,9 @@ def markdown(rows: list[tuple[str, float, float, float]]) -> str:
 def compare(
     run: Path, out: Path, settings: Settings, policies: Collection[str] = POLICIES
 ) -> dict[str, list[tuple[bool, float]]]:
-    """What `read_trials` reads, of `policies` and of those in `out`, where every policy's outcomes are kept and made
-    once. Raises ConfigError where they were made with other settings, and for a model that sees more frames than there
-    are to train it on."""
+    """What `read_trials` reads, for `policies` and for those in `out`, where every policy's outcomes are kept and made
+    once. Raises ConfigError if they were made with other settings, and for a model that sees more frames than there are
+    to train it on."""
     simulator = load_simulator(run)
     robot, size, task = simulator.robot(settings.robot), simulator.tokenizer.image_size, settings.make_task()
     window = simulator.model.config.frames

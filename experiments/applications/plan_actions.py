@@ -1,21 +1,21 @@
-"""What a learned simulator is worth to a planner.
+"""How useful a learned simulator is to a planner.
 
 Question: does a planner that looks ahead in the model reach goals in the true simulator?
-Paper: left for later there.
+Paper: left for future work there.
 Command: python -m experiments.applications.plan_actions RUN
-Cost: half an hour of one core, an hour for the model that is served; goes on where it was stopped.
-Expected: planning in the model comes near to planning in the true simulator, and both are above cloned and random
+Cost: half an hour of one core, an hour for the served model; continues where it was stopped.
+Expected: planning in the model comes close to planning in the true simulator, and both are above cloned and random
           actions.
 
-The goal is a picture: the last frame of an expert that began at the same start. Every second frame the planner looks,
-searches and carries out two actions. Cross-entropy method (CEM), MPPI and random shooting look ahead equally often, in
-the learned simulator; the ceiling is CEM that looks ahead in the true one. Success is that of the task, by the true
-simulator's state. The cloned policies were trained on trajectories of an expert at this task; they see the mark in the
-frame and are given no picture of the goal.
+The goal is an image: the last frame of an expert that began at the same start. At every second frame the planner
+observes, searches and executes two actions. The cross-entropy method (CEM), MPPI and random shooting look ahead equally
+often, in the learned simulator; the upper bound is CEM that looks ahead in the true one. Success is that of the task,
+by the true simulator's state. The cloned policies were trained on trajectories of an expert at this task; they see the
+mark in the frame and are given no image of the goal.
 
-Writes to OUT: trials.csv, a row per way of acting and start; summary.csv and table.md; planning.png. `distance` is from
-the goal at the end of an episode: a planner's ends once its outcome is decided, one of a cloned policy or of random
-actions with the last frame.
+Writes to OUT: trials.csv, a row per way of acting and start; summary.csv and table.md; planning.png. `distance` is that
+from the goal at the end of an episode: a planner's episode ends once its outcome is decided, an episode of a cloned
+policy or of random actions with the last frame.
 """
 
 from __future__ import annotations
@@ -77,17 +77,17 @@ NAMES = ["way", "start", "success", "distance", "seconds_per_plan"]
 
 @dataclass(frozen=True)
 class Settings:
-    """All that the results depend on besides the world model."""
+    """Everything that the results depend on besides the world model."""
 
     robot: str = "pusher_sand"
     task: str = "reach"
     frames: int = 16
     hold: int = 6  # frames in a row at the goal, for success
     starts: int = 30
-    skip: int = 0  # starts of the task before the first that is taken: others than an earlier run's
+    skip: int = 0  # number of the task's starts to skip, so that the starts differ from an earlier run's
     execute: int = 2  # frames from one plan to the next
-    unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
-    temperature: float = 0.0  # of sampling, whatever the run's decode.json says; 0: greedy decoding
+    unmask_steps: int = 2  # unmasking steps per frame: fewer than for viewing, and cheaper in proportion
+    temperature: float = 0.0  # of sampling, whatever the run's decode.json says; 0: greedy
     search: SearchConfig = field(default_factory=SearchConfig)
     steps: int = 2000  # of training of the cloned policies
     batch: int = 32
@@ -109,7 +109,7 @@ class Settings:
         return find_task(self.robot, self.task, self.frames, self.hold)
 
     def start_seeds(self) -> np.ndarray:
-        """int64 [starts]: of starts that no recording has."""
+        """int64 [starts]: seeds of starts that are in no recording."""
         return start_seeds(self.make_task(), self.skip + self.starts)[self.skip :]
 
 
@@ -119,7 +119,7 @@ def goal_image(task: Task, seed: int, size: int, stride: int) -> np.ndarray:
 
 
 def expert_end(task: Task, seed: int, stride: int) -> Environment:
-    """Where an expert without noise is that has twice the time of an episode."""
+    """Where an expert without noise ends if it has twice the time of an episode."""
     spec = noisy(task, 0.0)
     world, seen = World(spec, [seed]), Environment(spec)
     expert = make_expert(world, 0)
@@ -130,13 +130,13 @@ def expert_end(task: Task, seed: int, stride: int) -> Environment:
 
 
 def count_expert_actions(task: Task, stride: int) -> int:
-    """`stride`: actions of a frame."""
+    """The number of expert actions. `stride`: actions per frame."""
     return 2 * task.frames * stride
 
 
 def besides_settings(task: Task, stride: int) -> dict[str, int]:
-    """How many actions the expert has where a frame has several: in earlier versions it had fewer, so their goals were
-    others."""
+    """How many actions the expert has if a frame has several: in earlier versions it had fewer, so their goals were
+    different."""
     return {"expert_actions": count_expert_actions(task, stride)} if stride > 1 else {}
 
 
@@ -175,7 +175,7 @@ def decided(reached: Sequence[bool], task: Task) -> bool:
 
 
 def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, way: str, report: Report) -> list[dict]:
-    """The same starts under a policy that does not plan."""
+    """Runs the same starts under a policy that does not plan."""
     task = settings.make_task()
     policy: Policy = RandomPolicy(robot)
     if way in CLONED:
@@ -190,14 +190,14 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
 
 
 def outcome_paths(out: Path, way: str, starts: int) -> list[Path]:
-    """The files of the outcomes: of a planner one for each start, otherwise one for all."""
+    """The files of the outcomes: for a planner one for each start, otherwise one for all."""
     name = out / "trials" / way.replace(" ", "_")
     return [Path(f"{name}-{k}.json") for k in range(starts)] if way in PLANNERS else [Path(f"{name}.json")]
 
 
 def compare(run: Path, out: Path, settings: Settings, wanted: Collection[str]) -> dict[str, list[dict]]:
-    """What `read_trials` reads, of the ways of acting `wanted` and of those in `out`, where all outcomes are kept and
-    made once. Raises ConfigError where they were made with other settings."""
+    """What `read_trials` reads, for the ways of acting `wanted` and for those in `out`, where all outcomes are kept and
+    made once. Raises ConfigError if they were made with other settings."""
     decode = change_decode(find_decode(run), settings.temperature, unmask_steps=settings.unmask_steps)
     simulator = load_simulator(run, episodes=settings.search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
@@ -221,7 +221,7 @@ def compare(run: Path, out: Path, settings: Settings, wanted: Collection[str]) -
 
 
 def say_missed_goals(settings: Settings, robot: Robot, seeds: np.ndarray) -> None:
-    """A note for the user where an expert from these starts does not end at its goal."""
+    """Prints a note if an expert from these starts does not end at its goal."""
     missed = sum(not expert_end(settings.make_task(), seed, robot.stride).success() for seed in seeds.tolist())
     if missed:
         say(f"note: {missed} of {len(seeds)} pictures of the goal do not show success: the expert does not end at it")

@@ -34,7 +34,7 @@ class Points(NamedTuple):
 
     @property
     def absent(self) -> np.ndarray:
-        """Which colours no object has, bool [F, P]: they have no position."""
+        """bool [F, P]: colours that no object has; these points have no position."""
         return ~self.position.any(-1)
 
 

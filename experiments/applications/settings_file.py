@@ -1,4 +1,5 @@
-"""The settings file of a directory of results, so that none is taken for one of other settings or another model."""
+"""The settings file of a directory of results, so that no result is taken for one of other settings or another
+model."""
 
 from __future__ import annotations
 
@@ -22,10 +23,10 @@ from hma_jax.simulator.simulator import Simulator
 
 FILE = "settings.json"
 PROVENANCE = "provenance.jsonl"
-"""Beside it: a line for every start of a command on this directory. Results may be of several."""
+"""File beside it with a line for every start of a command on this directory. Results may come from several starts."""
 
 SIMULATOR = "simulator"
-"""The field of what a simulator's results depend on besides its weights."""
+"""The field with what a simulator's results depend on besides its weights."""
 
 SAMPLER = f"{SIMULATOR}.decode.sampler"
 """The field of how latents are sampled, on which no result of a model of token ids depends."""
@@ -41,12 +42,13 @@ def pin_settings(
     file: str = FILE,
 ) -> None:
     """Pins the directory `out` to the `simulator` of `run` and to `settings`, configurations or dicts with some:
-    writes them to `file` there or, where it exists, checks that it says the same. To be called once all are known to
-    be valid. Of a field that came later (`hma_jax.config.base.later`) a file without it says the value from before.
+    writes them to `file` there or, if it exists, checks that it says the same. To be called once all are known to be
+    valid. For a field that was added later (`hma_jax.config.base.later`), a file without it stands for the value from
+    before.
 
     Fields named in `may_differ` (how many results there are) and in `unused` (what no result depends on), and those
-    under them, may differ. Raises ConfigError, naming the differences, where another field does, and for a file of an
-    earlier version, which does not say how frames are filled.
+    under them, may differ. Raises ConfigError, naming the differences, if another field differs, and for a file of an
+    earlier version that does not say how frames are filled.
     """
     path, wanted = out / file, described(run, simulator, *settings)
     if path.exists():
@@ -76,7 +78,7 @@ def pin_settings(
 
 
 def write_settings(out: Path, run: Path, simulator: Simulator, *settings: Any, file: str = FILE) -> None:
-    """Writes the file anew, as after results were added that `may_differ` allows."""
+    """Writes the file anew, for instance after results were added that `may_differ` allows."""
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / file, json.dumps(described(run, simulator, *settings), indent=1) + "\n")
 

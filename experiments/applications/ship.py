@@ -1,16 +1,16 @@
-"""The model of `make play`, small enough for the repository, and what it is worth.
+"""Makes the model of `make play` small enough for the repository, and measures its quality.
 
 Command: hma train --preset play --out runs/play
          python -m experiments.applications.ship runs/play/model --out runs/shipped --unmask-steps 8 --temperature 0.7
-Cost: the first an hour and a half of one core and its tokenizer, resumed where it was stopped; the second three
-      minutes. Of the model that is served: docs/simulator.md.
-Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
+Cost: the first an hour and a half of one core, including its tokenizer, resumed where it was stopped; the second three
+      minutes. For the served model: docs/simulator.md.
+Expected: frames under held-out actions are nearer to the truth than the last frame repeated, and than frames under
           actions of other episodes.
 
-Writes weights (in half precision; their average, where the run keeps one), tokenizer, the robots' commands, starts of
-held-out episodes, how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model,
-of a still picture and of shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch
-1. clip.gif shows the first of them.
+Writes weights (in half precision; their average, if the run keeps one), tokenizer, the robots' commands, starts of
+held-out episodes, how frames are filled, and report.json: PSNR against the true simulator by frame, for the model, a
+still picture and shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch 1.
+clip.gif shows the first of these episodes.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ ZOOM, COLOURS = 2, 128  # of the clip
 
 
 class Shipped(NamedTuple):
-    """What a checkpoint for inference holds: the average where `train.ema_decay` is not 0, as `load_run` takes it."""
+    """What a checkpoint for inference holds: the averaged weights if `train.ema_decay` is not 0, as `load_run` takes
+    them."""
 
     params: Params
 
@@ -70,10 +71,10 @@ class Shipped(NamedTuple):
 def ship(
     source: Path, out: Path, decode: DecodeConfig | None = None, add: Callable[[Path], None] = lambda made: None
 ) -> None:
-    """Replaces `out`, whole or not at all, by the model and by what `add` writes beside it.
+    """Replaces `out`, completely or not at all, by the model and by what `add` writes beside it.
 
-    Raises ConfigError where `out` is something else than what was shipped before, for a robot outside the suite, and if
-    it would be too large.
+    Raises ConfigError if `out` is anything other than an earlier shipped model, for a robot outside the suite, and if
+    the model would be too large.
     """
     shipped = not out.exists() or (out / REPORT).is_file() or not any(out.iterdir())
     require(
@@ -128,7 +129,7 @@ class Rollouts(NamedTuple):
 
     true: np.ndarray
     model: np.ndarray
-    shuffled: np.ndarray  # of the model under the actions of the episode before
+    shuffled: np.ndarray  # the model's frames under the actions of the episode before
 
 
 def roll_out(simulator: Simulator, robot: Robot) -> Rollouts:

@@ -36,17 +36,17 @@ World = Literal["learned", "true"]
 
 STARTS_PER_ROBOT = 6
 START_FRAMES = 3
-"""Frames that an episode begins with: enough to see what moves."""
+"""Number of frames with which an episode begins: enough to see what moves."""
 
 DEAF = "the model was trained without actions (train.masking.setting passive), so its frames do not depend on them"
 
 
 def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any) -> Simulator:
-    """The learned simulator of a run, with robots and starts: those that are given, otherwise those that lie beside it
-    (`simulator.folder`) or else of the study's directory that the run is in, which may be one of its trials. `options`
-    are those of `Simulator.load`.
+    """The learned simulator of a run, with robots and starts: those that are given, otherwise those beside the run
+    (`simulator.folder`), or else those of the study whose directory holds the run (which may be one of its trials).
+    `options` are those of `Simulator.load`.
 
-    Raises ConfigError where there is no run, or nothing to start from, unless the caller has its own starts.
+    Raises ConfigError if there is no run, or nothing to start from, unless the caller has its own starts.
     """
     run = Path(run)
     study = Workspace.of_run(run)
@@ -68,10 +68,10 @@ def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any)
 
 
 def save_simulator(run: Path | str, out: Path | str) -> None:
-    """Makes `out` a run that is a simulator wherever it is copied to: the weights of `run` (their average where it
-    keeps one), without the optimiser's moments, and what `load_simulator` finds beside it or in its study.
+    """Makes `out` a run that is a simulator wherever it is copied: the weights of `run` (their average if it keeps
+    one), without the optimiser's moments, and what `load_simulator` finds beside it or in its study.
 
-    Raises ConfigError if `out` exists, and as `load_simulator`.
+    Raises ConfigError if `out` exists, and what `load_simulator` raises.
     """
     simulator = load_simulator(run)
     mark_absolute_actions(simulator, run)
@@ -81,8 +81,8 @@ def save_simulator(run: Path | str, out: Path | str) -> None:
 
 
 def save_beside(simulator: Simulator, directory: Path, decode: DecodeConfig | None) -> None:
-    """Writes beside a run in `directory` what `load_simulator` takes from there: tokenizer, robots, starts and, where
-    it is given, how frames are filled."""
+    """Writes beside a run in `directory` what `load_simulator` takes from there: tokenizer, robots, starts and, if it
+    is given, how frames are filled."""
     save_tokenizer(simulator.tokenizer, directory / TOKENIZER)
     save_robots(tuple(simulator.robots.values()), directory / ROBOTS)
     save_starts(simulator.starts, directory / STARTS)
@@ -91,10 +91,10 @@ def save_beside(simulator: Simulator, directory: Path, decode: DecodeConfig | No
 
 
 def make_simulator(run: Path | str, world: World = "learned", *, episodes: int = 1, **options: Any) -> AnySimulator:
-    """Either simulator of a run's robots: the same robots, ranges, starts and images' size.
+    """Either simulator of a run's robots, with the same robots, ranges, starts and image size.
 
-    Raises ConfigError for another word; for "true" if a robot has no true simulator, robots are of different ones, or
-    native actions are to be given one by one: a step of the truth is a frame of the model.
+    Raises ConfigError for another word, and for "true" if a robot has no true simulator, if the robots have different
+    ones, or if native actions are to be given one by one: a step of the true simulator is a frame of the model.
     """
     require_choice(world, get_args(World), "world")
     require(
@@ -107,7 +107,7 @@ def make_simulator(run: Path | str, world: World = "learned", *, episodes: int =
 
 
 def true_simulator(learned: Simulator, robots: Sequence[Robot], episodes: int = 1) -> TrueSimulator:
-    """The true simulator of some robots of a learned one, which sees what that sees."""
+    """The true simulator of some robots of a learned one, with the same view."""
     size = learned.tokenizer.image_size
     true = true_worlds(robots, episodes=episodes, image_size=size, outside=learned.outside)
     true.starts = learned.starts
@@ -115,8 +115,8 @@ def true_simulator(learned: Simulator, robots: Sequence[Robot], episodes: int = 
 
 
 def true_worlds(robots: Sequence[Robot], **options: Any) -> TrueSimulator:
-    """The true simulator of `robots`, which are all of the suite or all of physics simulators. Raises ConfigError
-    for others."""
+    """The true simulator of `robots`, which are all from the suite or all from physics simulators. Raises ConfigError
+    otherwise."""
     physics = bool(robots) and all(robot.name in PHYSICS for robot in robots)
     mixed = not physics and any(robot.name in PHYSICS for robot in robots)
     require(
@@ -137,8 +137,8 @@ def in_suite(robot: Robot) -> bool:
 
 
 def true_starts(robot: Robot, count: int, frames: int, size: int, *, seed: int = 0) -> list[Start]:
-    """Starts of `frames` frames of `size` pixels: of the first `count` held-out episodes of the suite those that are
-    long enough (`suite_starts`), or `count` new episodes of the robot's physics simulator."""
+    """Starts of `frames` frames of `size` pixels: from those of the suite's first `count` held-out episodes that are
+    long enough (`suite_starts`), or from `count` new episodes of the robot's physics simulator."""
     if not in_suite(robot):
         return physics_starts(robot.name, count, frames, stride=robot.stride, image_size=size, seed=seed)
     made = suite_starts(robot.name, count, frames, stride=robot.stride, seed=seed)
@@ -146,7 +146,7 @@ def true_starts(robot: Robot, count: int, frames: int, size: int, *, seed: int =
 
 
 def describe_robots(simulator: Simulator, workspace: Workspace) -> list[Robot]:
-    """The robots of a simulator with the ranges that were recorded, where the study's tokens are at hand."""
+    """The robots of a simulator, with the recorded ranges if the study's tokens are available."""
     store = _find_store(workspace)
     return [_describe(entry, store) for entry in simulator.model.table.entries if entry.action_dim]
 
@@ -191,8 +191,8 @@ def _are_absolute(store: TokenStore, name: str) -> bool:
 
 
 def find_starts(simulator: Simulator, workspace: Workspace) -> tuple[Start, ...]:
-    """Starts of every robot: of held-out episodes of its true simulator, otherwise those whose frames the token store
-    kept."""
+    """Starts of every robot: from held-out episodes of its true simulator, otherwise from those whose frames the token
+    store kept."""
     store = _find_store(workspace)
     starts: list[Start] = []
     for robot in simulator.robots.values():

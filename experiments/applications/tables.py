@@ -1,4 +1,4 @@
-"""Files of outcomes: JSON while they are being made, tables (CSV) of all of them."""
+"""Files of outcomes: JSON while they are being made, and tables (CSV) of all of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hma_jax.runtime.files import write_file
 
 
 def make_once(path: Path, make: Callable[..., Any], *args: Any) -> Any:
-    """The content of a JSON file; where there is none yet, `make(*args)` is written into it."""
+    """The content of a JSON file; if it does not exist yet, `make(*args)` is written into it."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, json.dumps(make(*args)))
@@ -21,14 +21,14 @@ def make_once(path: Path, make: Callable[..., Any], *args: Any) -> Any:
 
 
 def write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Replaces the file, whole or not at all."""
+    """Replaces the file, completely or not at all."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([names, *rows])
     write_file(path, text.getvalue())
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Rows with the names of the first one; four decimals of what is a float."""
+    """Writes rows with the names of the first one; floats have four decimals."""
     names = list(rows[0])
     cells = [[f"{v:.4f}" if isinstance(v := row[name], float) else v for name in names] for row in rows]
     path.parent.mkdir(parents=True, exist_ok=True)

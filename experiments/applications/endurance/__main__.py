@@ -1,11 +1,11 @@
-"""Question: how long does a learned simulator hold?
+"""Question: how long does a learned simulator stay correct?
 Command: python -m experiments.applications.endurance RUN --minutes 10 --out DIR
 Cost: ten minutes of eight robots, half an hour of one core for each variant.
-Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost before.
+Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost earlier.
 
-Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped, also in
-the middle of a film. Writes DIR/endurance.csv (a row per variant, drive, robot and minute), its curves and, of every
-variant, a sheet of frames, the truth above. A detector is needed (experiments.applications.detector).
+Each variant's measures are a file under DIR/films, made once: the same command continues where it was stopped, even in
+the middle of a film. Writes DIR/endurance.csv (a row per variant, drive, robot and minute), its curves and, for every
+variant, a sheet of frames with the truth above. A detector is needed (experiments.applications.detector).
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ PRINTED = (
 def film_path(
     out: Path, name: str, variant: str, kind: Kind, minutes: float, which: int, robots: Sequence[str]
 ) -> Path:
-    """`robots`: those that were asked for, none if all of the run are filmed."""
+    """`robots`: those that were asked for; empty if all robots of the run are filmed."""
     return out / "films" / f"{'-'.join([name, variant, kind, f'{minutes:g}', str(which), *robots])}.npz"
 
 
 def true_starts_of(simulator: Simulator, robots: Mapping[str, Robot], count: int) -> dict[str, list[Start]]:
-    """The first `count` starts of each robot that the true simulator can begin at. ConfigError where there are
+    """The first `count` starts of each robot at which the true simulator can begin. Raises ConfigError if there are
     fewer."""
     found = {n: [s for s in simulator.starts if s.robot == n and s.seed is not None][:count] for n in robots}
     for name, starts in found.items():
@@ -74,7 +74,7 @@ def true_starts_of(simulator: Simulator, robots: Mapping[str, Robot], count: int
 
 
 def load_variant(run: Path, variant: str, robots: int) -> Simulator:
-    """The simulator of `run` with the decoding settings of a variant, for so many robots in one batch."""
+    """The simulator of `run` with the decoding settings of a variant, for this number of robots in one batch."""
     decode = change_decode(find_decode(run), **VARIANTS[variant])
     return load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=robots, decode=decode, history=1)
 

@@ -1,7 +1,7 @@
 """Long sequences of actions for a robot, and the true rollout under them, from one start, in the true simulator.
 
 Actions come from the suite's behaviour, which sees the true state, or are of two kinds unlike anything that was
-recorded; the model is then given the same ones.
+recorded. The model is then given the same actions.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class Drive:
 
 
 def native_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
-    """The suite's robots that the model runs at their native rate (stride 1). Raises ConfigError if there are none."""
+    """The robots of the suite that the model runs at their native rate (stride 1). Raises ConfigError if there are
+    none."""
     native = {name: robot for name, robot in suite_robots(robots).items() if robot.stride == 1}
     require(
         bool(native),
@@ -72,7 +73,7 @@ def native_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
 
 def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -> Drive:
     """The true rollout of `frames` actions of a kind. Deterministic; `start` must have the seed of its episode. Every
-    robot has random numbers of its own, since intervals take robots as independent."""
+    robot has its own random numbers, since intervals assume that robots are independent."""
     spec = SPECS[robot.name]
     world = World(spec, [start.seed])
     for action in start.actions:

@@ -89,5 +89,5 @@ def draw_sheet(films: Mapping[str, Film], path: Path) -> None:
 
 
 def shown_frames(films: Mapping[str, Film]) -> tuple[int, ...]:
-    """Which frames the columns of a sheet are."""
+    """The frames that the columns of a sheet show."""
     return SHOWN[: min(film.shown.shape[1] for film in films.values())]

@@ -1,7 +1,7 @@
 """Rollouts of the learned and the true simulator under the same actions, and what is measured in their frames.
 
-All robots advance in one batch. Frames are not kept, but for a few of each to look at. Progress is saved after every
-`BLOCK` of frames until the films are complete, since they take half an hour.
+All robots advance in one batch. Frames are not kept, except a few of each robot to look at. Progress is saved after
+every `BLOCK` of frames until the films are complete, since they take half an hour.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hma_jax.simulator.episode import as_arrays, from_arrays
 from hma_jax.simulator.simulator import Simulator
 
 BLOCK = 64
-"""Frames that are measured together, and after which progress is saved."""
+"""Number of frames that are measured together, and after which progress is saved."""
 
 SHOWN = (1, 12, 24, 48, 120, 240, 600, 1200, 1800, 2400, 3600)
 """Frames that are kept to look at, where they are reached."""
@@ -38,14 +38,14 @@ class Film:
 
     psnr: np.ndarray  # dB, the model's against the true frame
     still: np.ndarray  # dB, the start's last frame against the true one
-    true_position: np.ndarray  # [n, P, 2], by the true state
+    true_position: np.ndarray  # [n, P, 2], from the true state
     true_share: np.ndarray  # [n, P], how much of the point is in view
     position: np.ndarray  # [n, P, 2], detected in the model's frames
     confidence: np.ndarray  # [n, P]
     seen_position: np.ndarray  # [n, P, 2], detected in the true frames
     seen_confidence: np.ndarray
-    level: np.ndarray  # mean grey level of the model's frame less that of the true one
-    variance: np.ndarray  # of the model's frame over that of the true one
+    level: np.ndarray  # mean grey level of the model's frame minus that of the true one
+    variance: np.ndarray  # of the model's frame, divided by that of the true one
     histogram: np.ndarray  # total variation between colour histograms of `BLOCK` frames of each, in [0, 1]
     shown: np.ndarray  # uint8 [2, k, H, W, 3]: true frames and the model's at `SHOWN`
 
@@ -57,7 +57,7 @@ def make_films(
     unfinished: Path,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Film]:
-    """One film for each drive, by the name of its robot; `simulator` has as many episodes. Resumes from the file
+    """One film for each drive, by the name of its robot; `simulator` has one episode for each. Resumes from the file
     `unfinished` if a killed process left it; the films are the same as without the kill."""
     simulator.reset([drive.start for drive in drives], seeds=0)
     first_frame, parts = _resume(simulator, drives, unfinished) if unfinished.exists() else (0, [[] for _ in drives])
@@ -109,7 +109,7 @@ def _resume(
 def _measure_block(
     detector: Detector, drive: Drive, points, start: int, film: np.ndarray, true: np.ndarray, start_frame: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The measures of frames start + 1 .. start + n; `film` and `true` have the frame before them, too."""
+    """The measures of frames start + 1 .. start + n; `film` and `true` include the frame before these."""
     name, n = drive.robot.name, len(film) - 1
     now, film, true = slice(start + 1, start + n + 1), film[1:], true[1:]
     detected, detected_true = (detector.detect(name, enlarged(images)) for images in (film, true))
@@ -140,7 +140,7 @@ def save_films(films: Mapping[str, Film], path: Path) -> None:
 
 
 def load_films(path: Path) -> dict[str, Film]:
-    """Raises ConfigError for a damaged file."""
+    """Loads films. Raises ConfigError for a damaged file."""
     with reading_arrays(path, "remove it; the same command then makes it again") as arrays:
         robots = list(dict.fromkeys(name.split("/")[0] for name in arrays))
         return {robot: Film(**{f.name: arrays[f"{robot}/{f.name}"] for f in fields(Film)}) for robot in robots}

@@ -1,14 +1,15 @@
 """Object permanence: are objects that were occluded or out of view still what and where they were?
 
 Command: python -m experiments.applications.endurance.hidden RUN --name NAME --out DIR
-Cost: two minutes of one core, three for the model that is served.
-Expected: within the model's window what was hidden comes back as often as what was never hidden is still there. Found:
-          it comes back less often; in small models the less the longer it was hidden (docs/endurance.md).
+Cost: two minutes of one core, three for the served model.
+Expected: within the model's window, hidden objects come back as often as objects that were never hidden are still
+          there. Found: they come back less often; in small models, the longer they were hidden the less often
+          (docs/endurance.md).
 
-Held-out episodes in which an object is covered by the robot or leaves the image, and is back within `HORIZON` frames
-after the start. Beside each stands a control: an object that is seen all the time, judged as long after a start of as
-many frames.
-Writes DIR/NAME_hidden.csv, a row per event; `moved_px` is how far the object truly is from where it was last seen.
+Events come from held-out episodes in which an object is covered by the robot or leaves the image, and is back within
+`HORIZON` frames after the start. Each has a control: an object that is seen all the time, judged equally long after a
+start with the same number of frames. Writes DIR/NAME_hidden.csv, a row per event; `moved_px` is how far the object
+truly is from where it was last seen.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
 EPISODES, HORIZON = 400, 30
-"""Episodes of each robot that are searched, and frames after the start within which the object must be back."""
+"""Number of episodes of each robot that are searched, and of frames after the start within which the object must be
+back."""
 
 WHOLE_SHARE = 0.6
 """Share of an object that must be in view before and after."""
@@ -61,12 +63,12 @@ class Event:
     episode: int
     start: int
     point: int
-    gone: int  # frames that it is not seen in between
+    gone: int  # number of frames in between in which it is not seen
     lag: int
 
 
 def find_events(share: np.ndarray, lengths: np.ndarray, tools: int, rng: np.random.Generator) -> list[Event]:
-    """Up to `PER_ROBOT` events, at most one of an episode, and a control for each, from shares [n, T, P] that are seen.
+    """Up to `PER_ROBOT` events, at most one per episode, and a control for each, from the visible shares [n, T, P].
 
     The start is the last frame before the object begins to vanish.
     """
@@ -122,7 +124,7 @@ def judge(
         actions.append(robot.clip_to_range(recorded[e.start : e.start + last], "clip")[0])
         true.append((images[-1], points_of(spec, np.repeat(seeds, len(q)), q, objects)))
     films = [simulator.reset(starts, seeds=0).copy()]
-    for t in range(last):  # all of them until the last is judged: other numbers of episodes would be compiled anew
+    for t in range(last):  # all run until the last is judged: another number of episodes would be compiled anew
         films.append(simulator.step([a[min(t, len(a) - 1)] for a in actions]).copy())
     film, rows = np.stack(films), []
     for b, (e, (image, points)) in enumerate(zip(events, true, strict=True)):
@@ -162,7 +164,7 @@ def main() -> None:
             share = points_of(spec, np.repeat(rollout.seeds, steps), *flat).share.reshape(n, steps, -1)
             events = find_events(share, rollout.lengths, len(spec.body.tools), rng)
             if events:
-                # episodes that are left over play the first event again
+                # unused episodes repeat the first event
                 judged = (events * (2 * PER_ROBOT))[: 2 * PER_ROBOT]
                 rows += judge(simulator, detector, spec, rollout, judged)[: len(events)]
             update(i + 1, len(robots), name)

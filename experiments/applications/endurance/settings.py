@@ -8,12 +8,12 @@ from experiments.applications.settings_file import pin_settings, short_hash
 from hma_jax.simulator.simulator import Simulator
 
 BEHAVIOUR = "drawn for each robot"
-"""How random numbers of the scripted policies are drawn: films that were begun otherwise are not continued."""
+"""How random numbers of the scripted policies are drawn: films that were begun in another way are not continued."""
 
 
 def pin_name(out: Path, name: str, run: Path, simulator: Simulator, detector: Path) -> None:
     """Pins `name` in the directory `out` to the `simulator` of `run` and to the weights at `detector` (`pin_settings`).
-    Raises ConfigError where it is pinned to others."""
+    Raises ConfigError if it is pinned to others."""
     pin_settings(
         out,
         run,

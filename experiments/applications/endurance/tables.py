@@ -14,7 +14,7 @@ from experiments.applications.endurance.films import Film
 from experiments.applications.scenes import VISIBLE_SHARE
 
 MIN_MOTION = 1e-3
-"""Pixels: a displacement whose standard deviation is less counts as no motion."""
+"""A displacement counts as no motion if its standard deviation, in pixels, is less than this."""
 
 MIN_STEP = 1.0
 """Pixels: the direction of a shorter displacement is not used."""
@@ -54,7 +54,7 @@ def measure(film: Film, part: slice, tools: int) -> dict[str, float]:
 
 
 def motion(true: np.ndarray, seen: np.ndarray, visible: np.ndarray, prefix: str) -> dict[str, float]:
-    """Pearson's correlations of detected displacements of tools [n, M, 2] with the true ones, from frame to frame where
+    """Pearson's correlations of detected displacements of tools [n, M, 2] with the true ones, from frame to frame while
     a tool is in view: `follows`, mean over image axes; `moves`, of their lengths; `steers`, mean over the components
     along and across the previous displacement. The last two do not depend on the robot's heading, which differs from
     the true one after the first error if commands are velocities in the robot's own frame."""
@@ -69,16 +69,15 @@ def motion(true: np.ndarray, seen: np.ndarray, visible: np.ndarray, prefix: str)
 
 
 def _relative_to_previous(displacements: np.ndarray) -> np.ndarray:
-    """Complex [n - 1, M]: displacements [n, M, 2] along (real) and across (imaginary) the previous one; 0 after
-    none."""
+    """Complex [n - 1, M]: displacements [n, M, 2] along (real) and across (imaginary) the previous one; 0 if the
+    previous one is 0."""
     z = displacements[..., 0] + 1j * displacements[..., 1]
     length = np.abs(z[:-1])
     return z[1:] * z[:-1].conj() / np.where(length > 0, length, 1.0)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's correlation of true and seen motion, in pixels; nan where the true tool rests, 0 where the seen one
-    does."""
+    """Pearson's correlation of true and seen motion, in pixels; nan if the true tool rests, 0 if the seen one does."""
     if len(a) < 3 or a.std() < MIN_MOTION:
         return float("nan")
     return float(np.corrcoef(a, b)[0, 1]) if b.std() >= MIN_MOTION else 0.0
@@ -101,8 +100,8 @@ def rows_of(
 
 
 def over_robots(rows: Iterable[Row], name: str) -> tuple[float, float, int]:
-    """(mean, half of the 95 % interval by Student's t, n) over robots, of the mean over each one's starts: robots are a
-    sample here, and others would differ. (nan, nan, 0) of what no robot has."""
+    """(mean, half of the 95 % interval by Student's t, n) over robots, of the mean over each robot's starts: robots are
+    a sample here, and other robots would differ. (nan, nan, 0) if no robot has the measure."""
     rows = [row for row in rows if np.isfinite(float(row[name]))]
     robots = dict.fromkeys(row["robot"] for row in rows)
     if not robots:

@@ -1,8 +1,9 @@
-"""How well success in the learned simulator tells success in the true one.
+"""How well success in the learned simulator predicts success in the true one.
 
 Rates are compared over P policies: Pearson, Spearman (ties averaged), and the mean maximum rank violation, the largest
-difference of true rates between a policy and one that the other world ranks otherwise, averaged (Li et al. 2024,
-"Evaluating Real-World Robot Manipulation Policies in Simulation"; here a tie of the learned rates counts for both).
+difference in true rate between a policy and one that the other world ranks the other way round, averaged (Li et al.
+2024, "Evaluating Real-World Robot Manipulation Policies in Simulation"; here a tie of the learned rates counts for both
+policies).
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ Measure = Callable[[np.ndarray, np.ndarray], float]
 
 
 def pearson(true: np.ndarray, learned: np.ndarray) -> float:
-    """nan where one of them does not vary, and of two, of which it is 1 or -1 whatever they are."""
+    """Pearson's correlation; nan if one of the arrays does not vary, and for two policies, for which it is always 1 or
+    -1."""
     # The mean of equal rates need not be one of them to the last bit, so the spread says whether they vary.
     if len(true) < 3 or np.ptp(true) == 0 or np.ptp(learned) == 0:
         return math.nan
@@ -44,7 +46,7 @@ def spearman(true: np.ndarray, learned: np.ndarray) -> float:
 
 
 def rank_violation(true: np.ndarray, learned: np.ndarray) -> float:
-    """Mean maximum rank violation; 0 where both order the policies alike, nan where the true rates have no order."""
+    """Mean maximum rank violation; 0 if both order the policies alike, nan if the true rates have no order."""
     if np.ptp(true) == 0:
         return math.nan
     gap = np.abs(true[:, None] - true[None])
@@ -67,18 +69,19 @@ MEASURES: dict[str, Measure] = {
 
 @dataclass(frozen=True)
 class Agreement:
-    """Measures of two worlds' success rates, with intervals over other policies of the kind and other starts."""
+    """Measures of two worlds' success rates, with intervals over other policies of the same kind and other starts."""
 
     measures: dict[str, Interval]  # with fewer than LEAST_POLICIES policies only the bias has an interval
-    over_starts: dict[str, Interval]  # of the same policies from other starts alone: see `_of_true_rates`
+    over_starts: dict[str, Interval]  # for the same policies, over other starts only: see `_of_true_rates`
 
 
 def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS) -> Agreement:
-    """From successes bool [P, M] of P policies at the same M starts.
+    """The agreement of successes bool [P, M] of P policies at the same M starts.
 
-    Intervals over policies and starts, and all of the bias, are quantiles of `draws` bootstrap resamples. A start drawn
-    is drawn in both worlds and for all policies. Draws in which a measure is not defined are left out. Over starts
-    alone correlations and rank violation are those of as many draws of true rates (`true_rates`).
+    Intervals over policies and starts, and all intervals of the bias, are quantiles of `draws` bootstrap resamples. A
+    drawn start is drawn in both worlds and for all policies. Draws in which a measure is not defined are left out. Over
+    starts only, the intervals of correlations and rank violation come from the same number of draws of true rates
+    (`true_rates`).
     """
     draw = lambda columns: true_PM[:, columns].mean(1)  # noqa: E731
     return _agree(true_PM.mean(1), draw, learned_PM, draws, lambda: noise_of_starts(true_PM, learned_PM))
@@ -87,9 +90,9 @@ def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS) -> Ag
 def agree_with_counts(
     successes_P: np.ndarray, episodes_P: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS
 ) -> Agreement:
-    """As `agree`, of policies of which elsewhere so many of so many episodes succeeded. Those are of other starts:
-    while the model's are resampled, each rate is drawn from what its count tells of it: Beta(s + 1/2, n - s + 1/2) of s
-    successes in n episodes (Jeffreys' prior), which leaves doubt at 0 and at n too."""
+    """Like `agree`, for policies whose successes were counted elsewhere, from other starts. While the model's starts
+    are resampled, each of those rates is drawn from its posterior: Beta(s + 1/2, n - s + 1/2) for s successes in n
+    episodes (Jeffreys' prior), which leaves uncertainty at 0 and at n too."""
     rng, failures_P = np.random.default_rng([0, 18]), episodes_P - successes_P
     draw = lambda columns: rng.beta(successes_P + 0.5, failures_P + 0.5)  # noqa: E731
     noise = lambda: noise_of_counts(successes_P, episodes_P, learned_PM)  # noqa: E731
@@ -103,8 +106,8 @@ def _agree(
     draws: int,
     noise: Callable[[], np.ndarray],
 ) -> Agreement:
-    """`draw` gives true rates [P] anew, where the starts drawn are `columns`; `noise` the covariance [P, 2, 2] of the
-    errors of measured ones."""
+    """`draw` gives new true rates [P] for drawn starts `columns`; `noise` gives the covariance [P, 2, 2] of the errors
+    of measured rates."""
     policies, starts = learned_PM.shape
     learned_P = learned_PM.mean(1)
     drawn: dict[str, list[float]] = {name: [] for name in MEASURES}
@@ -123,18 +126,18 @@ def _agree(
     if policies > 1 and starts >= LEAST_STARTS:
         measured = np.stack([true_P, learned_P], 1), noise()
         rates_nP2, known = draw_rates(*measured, draws), set(MEASURES)
-        if has_one_apart(*measured):  # its correlation would be taken for the order of the others
+        if has_one_apart(*measured):  # the outlier would be taken for the order of the others
             known -= {"spearman"}
         alone |= {name: _of_true_rates(alone[name], MEASURES[name], rates_nP2) for name in known}
-    # What all rates of a world have in common, and so the bias, is no part of those draws.
+    # What all rates of a world have in common, and so the bias, is not part of those draws.
     return Agreement(both, {**alone, "bias": _interval(value["bias"], np.array(biases), size)})
 
 
 def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS) -> Interval:
-    """How many of the episodes `among_PM` are `same_PM`, both bool [P, M] of P policies at the same M starts.
+    """The share of the episodes `among_PM` that are `same_PM`, both bool [P, M] of P policies at the same M starts.
 
-    Episodes of one policy, and of one start, resemble each other, so the interval is over other policies and starts;
-    but nowhere narrower than Wilson's, which holds at 0 and 1, where resampling knows no spread.
+    Episodes of one policy, and of one start, resemble each other, so the interval is over other policies and starts. It
+    is never narrower than Wilson's, which is valid at 0 and 1, where resampling shows no spread.
     """
     alike = same_PM & among_PM
     wilson = rate_interval(same_PM[among_PM])
@@ -149,8 +152,9 @@ def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS) -> Inte
 
 def mean_above(a_PM: np.ndarray, b_PM: np.ndarray, draws: int = DRAWS) -> Interval:
     """By how much the success of P policies at M starts is higher in `a_PM` than in `b_PM`, both bool [P, M], on
-    average; over other policies and starts. Where all differ alike, resampling knows no spread: as many episodes as
-    Wilson's interval of none of them allows may then differ by one more or less."""
+    average; the interval is over other policies and starts. If all differ alike, resampling shows no spread: the
+    interval then allows a difference of one, up or down, in as many episodes as Wilson's interval for zero successes
+    does."""
     apart = a_PM.astype(float) - b_PM
     drawn = np.array([apart[np.ix_(rows, columns)].mean() for rows, columns in _resamples(*apart.shape, draws)])
     above = _interval(float(apart.mean()), drawn, {"n": apart.size, "episodes": apart.shape[1]})
@@ -177,8 +181,8 @@ def _interval(value: float, drawn: np.ndarray, size: dict[str, int]) -> Interval
 
 
 def _of_true_rates(measured: Interval, measure: Measure, rates_nP2: np.ndarray) -> Interval:
-    """The interval over starts: `measure` of draws of the true rates. It is widened to contain what was `measured`,
-    since noise may have put that outside all draws."""
+    """The interval over starts: `measure` for draws of the true rates. It is widened to contain the `measured` value,
+    which noise may have put outside all draws."""
     if not math.isfinite(measured.mean):
         return measured
     size = {"n": measured.n, "episodes": measured.episodes}

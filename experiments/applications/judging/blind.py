@@ -1,7 +1,7 @@
 """A page on which a person labels successes without knowing the policy or what the judges say, and what the labels say.
 
-The world is not named, but can be seen: true frames are sharp, the model's are not. True ones are shown as the judges
-see them; decoded by the tokenizer they would be blurred too, but have none of the errors that the model makes."""
+The world is not named, but can be seen: true frames are sharp, the model's are not. True frames are shown as the judges
+see them; decoded by the tokenizer they would be blurred too, but would have none of the errors that the model makes."""
 
 from __future__ import annotations
 
@@ -93,12 +93,13 @@ def choose(judged: Judgement, clips: int, seed: int = 0) -> list[tuple[str, str,
 
 
 def write_blind(judged: Judgement, out: Path, clips: int = 60) -> Path:
-    """OUT/blind.html: clips by number alone. Which number is which episode stands in OUT/blind.json."""
+    """Writes OUT/blind.html, with clips identified only by number. OUT/blind.json says which number is which
+    episode."""
     chosen, pictures = choose(judged, clips), []
     for number, (policy, world, start) in enumerate(chosen):
         film = judged.rollouts(policy, world).images[start]
         pictures.append(f'<img hidden alt="clip {number}" data-clip="{number}" src="{data_uri(_film(film), "webp")}">')
-    drawn = hashlib.sha256("".join(pictures).encode()).hexdigest()[:12]  # labels are of these clips and of no others
+    drawn = hashlib.sha256("".join(pictures).encode()).hexdigest()[:12]  # labels belong to these clips and no others
     page = f"{judged.config.task.robot}-{judged.config.task.name}-{judged.config.seed}-{clips}-{drawn}"
     content = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
@@ -127,7 +128,7 @@ def _film(images: np.ndarray) -> bytes:
 
 
 def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
-    """{(policy, world, start): a person calls it success}. Raises ConfigError for labels of another page."""
+    """{(policy, world, start): whether a person calls it a success}. Raises ConfigError for labels of another page."""
     require(
         (out / "blind.json").is_file(),
         f"{out} holds no results of `hma judge` (no blind.json); give the --out of the command that evaluated the policies",

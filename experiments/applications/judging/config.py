@@ -12,19 +12,19 @@ from hma_jax.config import require
 
 @dataclass(frozen=True)
 class JudgeConfig:
-    """The task that policies are judged at, and how policies, starts and the success head are made."""
+    """The task at which policies are judged, and how policies, starts and the success head are made."""
 
     task: AnyTask
     starts: int = 50
     batch: int = 50  # episodes at once
     seed: int = 0
     demonstrations: int = 3000
-    demonstration_frames: int = 12  # as many as the task has, where the goal is held for more than half of these
-    noise: tuple[float, ...] = (0.0, 0.1)  # of the expert that is cloned
+    demonstration_frames: int = 12  # as many as the task has, if the goal is held for more than half of these
+    noise: tuple[float, ...] = (0.0, 0.1)  # noise of the expert that is cloned
     ladder: LadderConfig = field(default_factory=LadderConfig)
     head: HeadConfig = field(default_factory=HeadConfig)
     head_episodes: int = 3000
-    head_noise: tuple[float, ...] = (0.0, 0.2, 0.6)  # of the expert in the head's recordings; a third are play
+    head_noise: tuple[float, ...] = (0.0, 0.2, 0.6)  # noise of the expert in the head's recordings; a third are play
 
     def __post_init__(self):
         require(self.demonstrations >= 1, f"--demonstrations must be at least 1, got {self.demonstrations}")

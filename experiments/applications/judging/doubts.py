@@ -9,7 +9,7 @@ from experiments.applications.judging.recordings import LAST
 from experiments.applications.judging.summary import COMPARED, CONTROL, MODEL, shown
 
 MANY_BEYOND = 0.1
-"""A policy of which more than this share of actions is clipped may mean them in other units."""
+"""If more than this share of a policy's actions is clipped, it may use other units."""
 
 NOTHING = (
     "The rates are compared with nothing outside the model: there is no true simulator, and no success counts of the real "
@@ -21,7 +21,7 @@ NOTHING = (
 
 
 def doubts_of_rates(summary: dict[str, Any]) -> list[str]:
-    """All warnings but those that only intervals over starts need."""
+    """All warnings except those about intervals over starts."""
     said = (describe_control, describe_order, describe_clipping, describe_few_policies)
     return [warning for describe in said if (warning := describe(summary))]
 
@@ -32,7 +32,7 @@ def doubts_of_starts(summary: dict[str, Any]) -> list[str]:
 
 
 def describe_control(summary: dict[str, Any]) -> str:
-    """A warning that success in the model may not depend on the policies' actions; "" where it is known to."""
+    """A warning that success in the model may not depend on the policies' actions; "" if it is known to."""
     above = summary["above the control"]
     if above["low"] > 0:
         return ""
@@ -44,8 +44,8 @@ def describe_control(summary: dict[str, Any]) -> str:
 
 
 def describe_order(summary: dict[str, Any]) -> str:
-    """A warning that the control may order the policies as well as the model does; "" where the control's correlation
-    is below the model's interval, or the model has none."""
+    """A warning that the control may order the policies as well as the model does; "" if the control's correlation is
+    below the model's interval, or the model has none."""
     spearmans = {
         COMPARED[name]: agreed["policies and starts"]["spearman"] for name, agreed in summary["agreement"].items()
     }
@@ -60,7 +60,7 @@ def describe_order(summary: dict[str, Any]) -> str:
 
 
 def describe_clipping(summary: dict[str, Any]) -> str:
-    """A warning that names the user's policies of which many actions were clipped; "" where there is none."""
+    """A warning that names the user's policies with many clipped actions; "" if there are none."""
     shares = {name: summary["actions beyond the range"][name] for name in summary["own"]}
     many = [f"{name} ({share:.0%})" for name, share in shares.items() if share > MANY_BEYOND]
     if not many:
@@ -72,7 +72,7 @@ def describe_clipping(summary: dict[str, Any]) -> str:
 
 
 def describe_few_policies(summary: dict[str, Any]) -> str:
-    """A warning that the agreement is that of few policies; "" where these are enough, or nothing is compared."""
+    """A warning that the agreement is based on few policies; "" if there are enough, or nothing is compared."""
     compared = compared_policies(summary)
     if not compared or len(compared) >= LEAST_POLICIES:
         return ""
@@ -83,7 +83,7 @@ def describe_few_policies(summary: dict[str, Any]) -> str:
 
 
 def describe_few_starts(summary: dict[str, Any]) -> str:
-    """Why there are no intervals over starts; "" where there are, or nothing is compared."""
+    """Why there are no intervals over starts; "" if there are some, or nothing is compared."""
     if not summary["compared with"] or summary["starts"] >= LEAST_STARTS:
         return ""
     return (
@@ -93,7 +93,7 @@ def describe_few_starts(summary: dict[str, Any]) -> str:
 
 
 def describe_one_apart(summary: dict[str, Any]) -> str:
-    """Why Spearman's correlation has no interval over starts where only it has none; "" elsewhere."""
+    """Why Spearman's correlation alone has no interval over starts; "" otherwise."""
     if summary["starts"] < LEAST_STARTS:
         return ""
     spearmans = {name: agreed["starts"]["spearman"] for name, agreed in summary["agreement"].items()}

@@ -1,5 +1,5 @@
-"""What policies are judged against, and what does not come from the model: starts of episodes, labels of success, and
-the true simulator where there is one."""
+"""What policies are judged against, and does not come from the model: starts of episodes, labels of success, and the
+true simulator if there is one."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ Reconstruct = Callable[[np.ndarray], np.ndarray]
 
 
 class GroundTruth(Protocol):
-    """The ground truth of a robot: of its true simulator, or of recordings alone.
+    """The ground truth of a robot: from its true simulator, or only from recordings.
 
-    worlds: those in which policies act, in this order; the true one only where `open` gives it. `about`: what
-    identifies the source, for judge.json. Expensive parts are made by the methods, not before.
+    `worlds`: those in which policies act, in this order; the true one only if `open` gives it. `about`: what identifies
+    the source, for judge.json. Expensive parts are made when the methods are called.
     """
 
     config: JudgeConfig
@@ -52,11 +52,11 @@ class GroundTruth(Protocol):
         ...
 
     def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
-        """A trained success head, not measured yet."""
+        """A trained success head whose accuracy is not measured yet."""
         ...
 
     def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
-        """The accuracy of a head on episodes that no head is trained on."""
+        """The accuracy of a head on episodes on which no head is trained."""
         ...
 
     def starts(self) -> list[Start]: ...
@@ -73,14 +73,14 @@ class SimulatedTruth:
     worlds = WORLDS
 
     def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator):
-        """Raises ConfigError for a robot that has none."""
+        """Raises ConfigError for a robot without a true simulator."""
         require(has_truth(robot), f"{robot.name} has no true simulator here; give recordings of it with --recordings")
         self.config, self.robot, self._learned = config, robot, learned
         self._size = learned.tokenizer.image_size
 
     def about(self) -> dict[str, Any]:
-        """The length of demonstrations where it is not the one asked for, which earlier versions recorded; left out
-        where none of that length could have succeeded."""
+        """The length of demonstrations if it is not the one asked for. Earlier versions recorded the latter; left out
+        if no demonstration of that length could have succeeded."""
         frames, asked = self._demonstrated_frames(), self.config.demonstration_frames
         return {"demonstrated_frames": frames} if frames != asked and self.config.task.hold <= asked else {}
 
@@ -127,7 +127,7 @@ class SimulatedTruth:
 
 def describe_rare_success(demos: Demonstrations, task: Task) -> str:
     """A warning that the suite's expert rarely succeeds at its robot's own task, so that policies cannot learn it; ""
-    where it succeeds, or where there is no easier task."""
+    if it succeeds, or if there is no easier task."""
     done = float(demos.successes.mean())
     if not task.in_suite or task.name != OWN or done >= OFTEN:
         return ""

@@ -1,7 +1,7 @@
-"""The success head: from the present frame and the episode's first one, how probable it is that the goal is reached.
+"""The success head: the probability that the goal is reached, from the present frame and the episode's first frame.
 
-A model may lose the mark once something covers it; the first frame shows where it is. Trained on recorded frames that
-the simulator's state labels; some of them as the model's tokenizer would show them."""
+A model may lose the mark once something covers it; the first frame shows where it is. It is trained on recorded frames
+with labels from the simulator's state; some of them are shown as the model's tokenizer would show them."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ RECONSTRUCTED = 4
 
 @dataclass(frozen=True)
 class HeadConfig:
-    """A head and its training. An episode has succeeded when the probability is above `threshold` at `hold` frames in
-    a row: the number that the task asks of the state."""
+    """A head and its training. An episode has succeeded when the probability is above `threshold` at `hold` frames in a
+    row, the same number that the task requires of the state."""
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=lambda: FitConfig(steps=3000, learning_rate=2e-3))
@@ -87,11 +87,11 @@ class Head(ABC):
 
     @abstractmethod
     def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each. `first`, which may have the
-        size 1 where `images` have frames of one episode, are those in which the episodes begin."""
+        """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each. `first`: the frames in which
+        the episodes begin; an axis may have size 1 where `images` has frames of one episode."""
 
     def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        """bool [...]: it is taken for reached."""
+        """bool [...]: whether the goal is taken to be reached."""
         return self.probabilities(images, first) > self.threshold
 
 
@@ -112,7 +112,7 @@ class SuccessHead(Head):
 
     def predict_pairs(self, pairs: np.ndarray) -> np.ndarray:
         """float32 [n] of pairs uint8 [n, 2, size, size, 3], as heads are trained on."""
-        parts, size = [], min(PIECE, 1 << (len(pairs) - 1).bit_length())  # a few episodes are judged at every frame
+        parts, size = [], min(PIECE, 1 << (len(pairs) - 1).bit_length())  # few episodes are judged at every frame
         for at in range(0, len(pairs), PIECE):
             part = pairs[at : at + PIECE]
             padded = np.zeros((size, *part.shape[1:]), np.uint8)
@@ -128,10 +128,10 @@ def train_head(
     reconstruct: Callable[[np.ndarray], np.ndarray],
     report: Report,
 ) -> SuccessHead:
-    """A function of its arguments. Positive and negative frames are drawn equally often.
+    """Trains a head; a pure function of its arguments. Positive and negative frames are drawn equally often.
 
-    `reconstruct` gives uint8 [n, H, W, 3] as the model's tokenizer shows them: every `RECONSTRUCTED`-th is learnt so.
-    Raises ConfigError where all frames have one label.
+    `reconstruct` returns frames uint8 [n, H, W, 3] as the model's tokenizer shows them: every `RECONSTRUCTED`-th frame
+    is learnt in this form. Raises ConfigError if all frames have the same label.
     """
     episode, frame = demos.steps()
     images, first, labels = demos.images[episode, frame], demos.images[episode, 0], demos.reached[episode, frame]
@@ -149,11 +149,12 @@ def fit_heads(
     report: Report,
     shift: int = 0,
 ) -> dict[int, SuccessHead]:
-    """{step: head} of every step of training that `config.fit` keeps, the last included.
+    """{step: head} for every step of training that `config.fit` keeps, including the last.
 
     From n pairs of frames uint8 [n, 2, size, size, 3], the episode's first and the present one, and whether the goal is
-    reached in the latter, bool [n]. Each time that a pair is seen both are moved by up to `shift` pixels, alike: of few
-    recordings it would otherwise learn by heart where things were. Raises ConfigError where all have one label."""
+    reached in the latter, bool [n]. Each time a pair is seen, both frames are shifted together by up to `shift` pixels:
+    from few recordings the head would otherwise memorise where things were. Raises ConfigError if all have the same
+    label."""
     require(bool(labels.any()) and not labels.all(), "a success head needs training frames with success and without")
     weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
     data = {"images": pairs, "label": labels.astype(np.float32), "weight": weight}
@@ -168,7 +169,7 @@ def fit_heads(
 
 
 def measure_head(head: Head, demos: Demonstrations, task: Task) -> dict[str, float]:
-    """On recorded true frames: accuracy and AUROC of frames, and accuracy of whole episodes."""
+    """Measures on recorded true frames: accuracy and AUROC of frames, and accuracy of whole episodes."""
     steps = demos.steps()
     score = head.probabilities(demos.images, demos.images[:, :1])
     by_head = held(score > head.threshold, task.hold).any(1)
@@ -197,7 +198,8 @@ def balanced_error(head: SuccessHead, pairs: np.ndarray, labels: np.ndarray) -> 
 
 
 def auroc(score: np.ndarray, label: np.ndarray) -> float:
-    """The probability that a positive scores higher than a negative, ties half; nan where one kind is missing."""
+    """The probability that a positive scores higher than a negative, with ties counted half; nan if one kind is
+    missing."""
     positive = label.astype(bool)
     n, m = int(positive.sum()), int((~positive).sum())
     if not n or not m:
@@ -206,7 +208,7 @@ def auroc(score: np.ndarray, label: np.ndarray) -> float:
 
 
 def save_head(head: SuccessHead, directory: Path) -> None:
-    """The description is written last: a directory holds a whole head or none."""
+    """The description is written last: a directory holds a complete head or none."""
     directory.mkdir(parents=True, exist_ok=True)
     (directory / DESCRIPTION).unlink(missing_ok=True)
     write_file(directory / WEIGHTS, save(named(head.params)))
@@ -217,7 +219,7 @@ def save_head(head: SuccessHead, directory: Path) -> None:
 
 
 def load_head(directory: Path) -> SuccessHead:
-    """Raises ConfigError where none is, or a damaged one."""
+    """Loads a head. Raises ConfigError if there is none, or it is damaged."""
     try:
         description: dict[str, Any] = json.loads((directory / DESCRIPTION).read_text())
         weights = load_file(directory / WEIGHTS)
@@ -236,9 +238,9 @@ class _EpisodeState(NamedTuple):
 
 
 class HeadJudge:
-    """A `Judge` of the simulators' Gymnasium environments: 1 and the end once the head has seen success at `hold`
-    frames in a row. The environment says when episodes begin. Environments may share a judge: what it keeps is each
-    simulator's own."""
+    """A `Judge` for the simulators' Gymnasium environments: returns 1 and ends the episode once the head has seen
+    success at `hold` frames in a row. The environment says when episodes begin. Environments may share a judge: it
+    keeps separate state for each simulator."""
 
     def __init__(self, head: Head, hold: int = 1):
         self.head, self.hold = head, hold

@@ -1,9 +1,9 @@
-"""`hma judge` from end to end: policies, head, rollouts, table, figures. What is finished is found again.
+"""`hma judge` from end to end: policies, head, rollouts, table, figures. Finished parts are reused.
 
-OUT/judge.json           what is judged; another command does not go on in the same directory
-OUT/own_policies.py      the user's file, where there is one
+OUT/judge.json           what is judged; a different command does not continue in the same directory
+OUT/own_policies.py      the user's file, if there is one
 OUT/policies/NAME        checkpoints (`policies.files`)
-OUT/head                 the success head, or of a user's own what it was found to be worth
+OUT/head                 the success head, or the measured accuracy of a user's own
 OUT/rollouts/NAME.WORLD.npz   frames of all episodes
 OUT/outcomes.csv, agreement.json, scatter.png, judge.html, blind.html
 """
@@ -54,19 +54,19 @@ class Judgement:
     config: JudgeConfig
     head: Head
     policies: tuple[str, ...]
-    user_policies: tuple[str, ...]  # of these, the user's
+    user_policies: tuple[str, ...]  # those of them that are the user's
     worlds: tuple[str, ...]
     outcomes: tuple[Outcome, ...]
     clipped: dict[str, float]  # the share of each policy's actions in the model that were clipped to the robot's range
-    seconds: dict[str, float]  # per episode in each world, of the simulator's steps
+    seconds: dict[str, float]  # seconds per episode in each world, for the simulator's steps only
     rollouts: Callable[[str, str], Rollout]  # by policy and world
 
 
 def judge_run(run_directory: Path, out: Path, config: JudgeConfig, user_file: Path | None = None) -> Judgement:
     """The ladder's policies, and those of the user's file `user_file`, in the true and in the learned simulator.
 
-    Raises ConfigError where `out` holds other judgements, the robot is not the run's or has no true simulator, or what
-    the file gives are no policies.
+    Raises ConfigError if `out` holds other judgements, if the robot is not the run's or has no true simulator, or if
+    the file does not give policies.
     """
     simulator = load_simulator(run_directory, episodes=config.batch)
     _require_policy(simulator, user_file is not None or any(config.ladder.counts.values()))
@@ -84,8 +84,8 @@ def judge_recorded(
     counted: Sequence[str] = (),
 ) -> Judgement:
     """The same for a robot without a true simulator, whose recordings in `dataset` say what success looks like. There
-    are no more starts, nor episodes at once, than recordings are held out. `counted` are the policies whose successes
-    on the real robot were counted.
+    are at most as many starts, and episodes at once, as held-out recordings. `counted`: the policies whose successes on
+    the real robot were counted.
 
     Raises ConfigError as `judge_run` does, for recordings that are not the robot's, and for too few of them;
     EpisodeError for one that cannot be read.
@@ -100,19 +100,19 @@ def judge_recorded(
 
 
 def _require_policy(simulator: Simulator, given: bool) -> None:
-    """Raises ConfigError where neither are policies given nor is the model one."""
+    """Raises ConfigError if no policies are given and the model is not a policy itself."""
     some = given or _predicts_actions(simulator)
     require(some, "there is no policy to evaluate except the random one: give --policies FILE")
 
 
 def _predicts_actions(simulator: Simulator) -> bool:
-    """Whether the model itself is a policy: heads alone do not make it one, which know nothing until actions are
-    trained."""
+    """Whether the model itself is a policy: action heads alone do not make it one, since they know nothing until
+    actions are trained."""
     return predicts_actions(simulator.model.config, simulator.model.run.train.masking.setting)
 
 
 def _with_episodes(simulator: Simulator, episodes: int) -> Simulator:
-    """The same one with so many episodes at once."""
+    """The same simulator with this number of episodes at once."""
     robots = tuple(simulator.robots.values())
     return Simulator(simulator.model, simulator.tokenizer, robots=robots, episodes=episodes, decode=simulator.decode)
 
@@ -126,7 +126,7 @@ def _judge(
     counted: Sequence[str] = (),
 ) -> Judgement:
     config, robot = truth.config, truth.robot
-    policies = names(config.ladder) + [OWN_HEAD] * _predicts_actions(simulator)  # may refuse the ladder
+    policies = names(config.ladder) + [OWN_HEAD] * _predicts_actions(simulator)  # this may refuse the ladder
     user_policies, success, about = {}, None, truth.about()
     if user_file is not None:
         user_policies, success = load_user_policies(user_file, robot)
@@ -151,7 +151,7 @@ def _judge(
         train_ladder(out / "policies", truth.demonstrations, config.ladder, config.seed, about_policies, report)
     head = _find_head(out / "head", truth, simulator, success)
     starts = truth.starts()
-    acting: dict[str, Policy] = dict(user_policies)  # what was compiled for one world serves the next
+    acting: dict[str, Policy] = dict(user_policies)  # programs compiled for one world serve the next
     with truth.open() as true:
         for world, name in itertools.product(truth.worlds, policies):
             path = _place(out, name, world)
@@ -185,7 +185,7 @@ def _collect(
             outcomes += judge_rollout(rollout, head, config.task, name, world, numbers, config.seeds)
             if world == LEARNED:
                 clipped[name] = _clipped_share(rollout.actions, truth.robot)
-        seconds[world] = float(np.median(np.concatenate(times)))  # the first one compiles
+        seconds[world] = float(np.median(np.concatenate(times)))  # the first call compiles
     rollouts = lambda name, world: load_rollout(_place(out, name, world))  # noqa: E731
     return Judgement(
         config, head, tuple(policies), user_policies, truth.worlds, tuple(outcomes), clipped, seconds, rollouts
@@ -193,7 +193,7 @@ def _collect(
 
 
 def _clipped_share(actions: np.ndarray, robot: Robot) -> float:
-    """The share of actions [..., A] of which a value lies outside the robot's range, to which it is then moved."""
+    """The share of actions [..., A] with a value outside the robot's range, to which it is then clipped."""
     low, high = np.array(robot.low, np.float32), np.array(robot.high, np.float32)
     return float(((actions < low) | (actions > high)).any(-1).mean())
 

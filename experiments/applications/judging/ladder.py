@@ -25,7 +25,7 @@ OWN_HEAD = "hma"
 
 @dataclass(frozen=True)
 class LadderConfig:
-    """How many checkpoints of each kind of policy (`KINDS`); the random one comes on top."""
+    """How many checkpoints of each kind of policy (`KINDS`) there are, in addition to the random policy."""
 
     cloned: int = 6
     diffusion: int = 3
@@ -33,7 +33,7 @@ class LadderConfig:
     first: int = 60  # the step of the first checkpoint
     batch: int = 64
     learning_rate: float = 2e-3
-    frames: int = 1  # from two a policy would read what was just done, and merely repeat it
+    frames: int = 1  # from two frames a policy would read what was just done, and merely repeat it
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
 
     def __post_init__(self):
@@ -46,7 +46,7 @@ class LadderConfig:
         return {kind: getattr(self, kind) for kind in KINDS}
 
     def fits(self) -> dict[str, FitConfig]:
-        """{kind of policy: its training}, of those that have checkpoints."""
+        """{kind of policy: its training}, for kinds that have checkpoints."""
         return {kind: self._fit(count) for kind, count in self.counts.items() if count}
 
     def _fit(self, count: int) -> FitConfig:
@@ -67,7 +67,8 @@ def train_ladder(
     about: dict[str, str],
     report: Report,
 ) -> None:
-    """Trains what is not in `directory` yet: all checkpoints of a kind, or none. `demos` are recorded if needed."""
+    """Trains the kinds that are not in `directory` yet, each with all its checkpoints. `demos` are recorded if
+    needed."""
     recorded: Demonstrations | None = None
     for kind, fit in config.fits().items():
         if all((directory / f"{kind}-{step}" / DESCRIPTION).exists() for step in fit.keep):
@@ -79,12 +80,12 @@ def train_ladder(
 
 
 def kind_of(name: str) -> str:
-    """The kind of a policy that is made here, by its name; as in `KINDS` where it is trained."""
+    """The kind of a policy that is made here, by its name; for trained policies as in `KINDS`."""
     return name.split("-")[0]
 
 
 def find_policy(directory: Path, name: str, robot: Robot, simulator: Simulator) -> Policy:
-    """Raises ConfigError where it is not, or damaged."""
+    """The policy called `name`. Raises ConfigError if it does not exist, or is damaged."""
     if name == RANDOM:
         return RandomPolicy(robot)
     if name == OWN_HEAD:

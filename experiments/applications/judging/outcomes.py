@@ -19,14 +19,14 @@ from hma_jax.config import ConfigError
 
 TRUE, LEARNED, SHUFFLED = "true", "learned", "shuffled"
 WORLDS = (TRUE, LEARNED, SHUFFLED)
-"""SHUFFLED: the learned one, in which an episode executes what the policy does in another."""
+"""SHUFFLED: the learned world, where each episode executes what the policy does in another one."""
 
 STATE, HEAD = "state", "head"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one judge says of one episode. `start` counts the starts, `number` is the suite's seed of it."""
+    """What one judge says about one episode. `start` counts the starts, `number` is the suite's seed of the start."""
 
     policy: str
     start: int
@@ -49,7 +49,7 @@ def judge_rollout(
     numbers: Sequence[int],
     seeds: Sequence[int],
 ) -> list[Outcome]:
-    """By the head in every world, by the state in the true one. The start itself does not count."""
+    """Judges by the head in every world, and by the state in the true one. The start itself does not count."""
     successes_by_judge = {HEAD: held(head.reached(rollout.images[:, 1:], rollout.images[:, :1]), task.hold).any(1)}
     if world == TRUE:
         successes_by_judge[STATE] = held(rollout.reached[:, 1:], task.hold).any(1)
@@ -71,7 +71,7 @@ def write_outcomes(outcomes: Sequence[Outcome], path: Path) -> None:
 
 
 def read_outcomes(path: Path) -> list[Outcome]:
-    """Raises ConfigError for a file that is damaged or something else."""
+    """Reads outcomes. Raises ConfigError for a file that is damaged or something else."""
     try:
         with open(path, newline="") as file:
             return [

@@ -11,7 +11,7 @@ from hma_jax.config import ConfigError, require
 COLUMNS = ("policy", "successes", "episodes")
 
 FEWEST = 3
-"""Policies: two are always in perfect order, or in perfect disorder."""
+"""Least number of policies: two are always in perfect order or perfect disorder."""
 
 
 class Count(NamedTuple):
@@ -22,7 +22,7 @@ class Count(NamedTuple):
 
 
 def read_real(path: Path) -> dict[str, Count]:
-    """{policy: its count}. Raises ConfigError, naming the line, for what is none."""
+    """{policy: its count}. Raises ConfigError, naming the line, for a line that is not a count."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:  # spreadsheets begin a file with a byte order mark
             reader = csv.DictReader(file)

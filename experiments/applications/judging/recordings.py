@@ -1,9 +1,9 @@
 """A robot without a true simulator: recordings that say whether they succeeded teach the head, and episodes begin as
-they did.
+the recordings did.
 
-A recording counts from where a policy would take over, the last frame of a start. Where its rewards say frame by frame
-whether the goal is reached, all its frames teach the head. Otherwise frames of unknown label, between the first half of
-a success and its last `hold` frames, are left out.
+A recording counts from where a policy would take over, the last frame of a start. If its rewards say frame by frame
+whether the goal is reached, all its frames teach the head. Otherwise frames with unknown label, between the first half
+of a success and its last `hold` frames, are left out.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
 FEWEST = 8
-"""Recordings of either kind that are needed: two of them are held out."""
+"""Least number of recordings of each kind: two of them are held out."""
 
 HELD_OUT = 4
-"""Every so many recordings of a kind are held out: nothing is learnt from them, the head is measured on them, and
-episodes begin as they did."""
+"""One of this many recordings of a kind is held out: nothing is learnt from it, the head is measured on it, and
+episodes begin as it did."""
 
 TUNED_ON = 5
-"""Every TUNED_ON-th training recording of a kind chooses the training step at which the head is best: a head soon
-overfits few recordings."""
+"""Every TUNED_ON-th training recording of a kind is used to choose the training step at which the head is best: a head
+soon overfits few recordings."""
 
 LIGHT, SHIFT = 0.15, 1 / 8
-"""For the same reason frames are shown in more kinds of light than `HeadConfig` does, and moved by up to this share of
-a side. With 230 recordings of a pusher, half of them successes, 54 of 76 held-out ones were then classified correctly
-instead of 39."""
+"""For the same reason the light of frames is varied more than `HeadConfig` says, and frames are shifted by up to this
+share of a side. With 230 recordings of a pusher, half of them successes, 54 of 76 held-out ones were then classified
+correctly instead of 39."""
 
 FIRST, CHECKPOINTS = 50, 12
-"""Steps of training after which a head may be best: the fewest, and how many of them."""
+"""Training steps at which a head may be best: the first of them, and their number."""
 
 MOST = 0.9
-"""This share of the recorded successes is not longer than an episode, where its length is not given."""
+"""If the length of an episode is not given, this share of the recorded successes is no longer than an episode."""
 
 LAST = "last frames taken for reached"
-"""Where no reward says at which frames a goal was reached, so many last frames of each recorded success count as
+"""If no reward says at which frames the goal was reached, this many last frames of each recorded success count as
 reached."""
 
 BEFORE = START_FRAMES - 1
@@ -100,9 +100,9 @@ class RecordedTruth:
         )
         self.held_out = sorted((i for kind in kinds for i in kind[: len(kind) // HELD_OUT]), key=usable.index)
         self.learnt = [i for i in usable if i not in set(self.held_out)]
-        frames = task.frames or int(np.ceil(np.quantile(length[kinds[0]], MOST))) - 1  # one is the start's
+        frames = task.frames or int(np.ceil(np.quantile(length[kinds[0]], MOST))) - 1  # one frame is the start's
         instruction = recorded[self.held_out[0]].instructions[0]
-        # As starts in true worlds do, those begin before their goal is reached, of which that is known.
+        # As in true worlds, episodes start before their goal is reached, if that is known.
         self._begun_from = [i for i in self.held_out if self._reached is None or not self._reached[i][0]]
         require(
             len(self._begun_from) >= 2,
@@ -122,8 +122,8 @@ class RecordedTruth:
         )
 
     def _read_rewards(self, least: float | None, frames: Sequence[int]) -> list[np.ndarray] | None:
-        """For every recording: in which of the n frames that are looked at its rewards say that the goal is reached,
-        bool [n]. None without a `least` reward."""
+        """For every recording, bool [n]: in which of the n frames used its rewards say that the goal is reached. None
+        without a `least` reward."""
         if least is None:
             return None
         reached = []
@@ -174,7 +174,7 @@ class RecordedTruth:
 
     def _pairs(self, i: int, reconstruct: Reconstruct) -> tuple[np.ndarray, np.ndarray]:
         """Training pairs and labels of one recording for `fit_heads`. A random half of the frames is shown as the
-        tokenizer reconstructs them: were they taken by turns, all frames of one kind could fall into one half."""
+        tokenizer reconstructs them: if they alternated, all frames of one kind could fall into one half."""
         images, rng = self._images(i), np.random.default_rng([self.config.seed, i, 17])
         chosen, label = self._labelled(i, len(images))
         seen = np.stack([np.broadcast_to(images[0], images[chosen].shape), images[chosen]], 1)
@@ -184,8 +184,8 @@ class RecordedTruth:
         return downsample_uint8(seen, self.config.head.encoder.size), label
 
     def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
-        """From first to last frame of the recordings that are held out; also as the model's tokenizer shows them, which
-        is how it sees those of the model."""
+        """Measures on all frames of the held-out recordings, also as the model's tokenizer shows them, which is how the
+        head sees the model's frames."""
         hold, successes = self.config.task.hold, self._success[self.held_out]
         scores, labels, decisions, decoded_decisions = [], [], [], []
         for i in self.held_out:
@@ -228,8 +228,8 @@ class RecordedTruth:
 
 def labelled(length: int, success: bool, hold: int) -> tuple[np.ndarray, np.ndarray]:
     """The frames of a recording without rewards whose label is known, int [n], and these labels, bool [n]. The goal is
-    reached in no frame of a failure; in each of the last `hold` frames of a success, and in none of its first half
-    before them.
+    reached in no frame of a failure; in a success it is reached in each of the last `hold` frames, and in no earlier
+    frame of its first half.
     """
     if not success:
         return np.arange(length), np.zeros(length, bool)
@@ -238,7 +238,7 @@ def labelled(length: int, success: bool, hold: int) -> tuple[np.ndarray, np.ndar
 
 
 def _one_by_one(numbers: Sequence[int], report: Report) -> Iterator[int]:
-    """The numbers of recordings, while it is reported how many have been read."""
+    """Yields the numbers of recordings, and reports how many have been read."""
     for done, i in enumerate(numbers):
         report(done, len(numbers), "recordings")
         yield i

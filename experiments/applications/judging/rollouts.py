@@ -1,4 +1,4 @@
-"""One policy in one world: the same starts and seeds in each, images and what the state says of them."""
+"""One policy in one world, with the same starts and seeds in each: images, and what the state says about them."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ STARTS_SEED = 2
 
 @dataclass(frozen=True)
 class Rollout:
-    """M episodes of L frames, the first of them the last of the start.
+    """M episodes of L frames; the first frame is the last one of the start.
 
-    images uint8 [M, L, H, W, 3]; reached bool [M, L] by state, all False where there is no state; seconds: of the steps
-    alone, without the policy; actions float32 [M, L - 1, A], of a policy that gives whole chunks
-    [M, L - 1, stride, A].
+    images uint8 [M, L, H, W, 3]; reached bool [M, L] by state, all False if there is no state; seconds: of the steps
+    only, without the policy; actions float32 [M, L - 1, A], or [M, L - 1, stride, A] for a policy that gives whole
+    chunks.
     """
 
     images: np.ndarray
@@ -67,7 +67,7 @@ def run(
     shuffled: bool = False,
     report: Report = lambda done, total, note: None,
 ) -> Rollout:
-    """Every start once, as many at a time as the simulator has episodes.
+    """Runs every start once, as many at a time as the simulator has episodes.
 
     `shuffled`: what the policy does in one episode is executed in the next one of the same batch, a control that
     should succeed no more often than chance.
@@ -112,11 +112,11 @@ def _reached(simulator: AnySimulator, task: AnyTask) -> np.ndarray:
 
 
 def save_rollout(rollout: Rollout, path: Path) -> None:
-    """Whole or not at all."""
+    """Writes the rollout, completely or not at all."""
     write_arrays(path, vars(rollout))
 
 
 def load_rollout(path: Path) -> Rollout:
-    """Raises ConfigError for a damaged file."""
+    """Loads a rollout. Raises ConfigError for a damaged file."""
     with reading_arrays(path, "remove it; the same command then makes it again") as arrays:
         return Rollout(**{f.name: arrays[f.name] for f in fields(Rollout)})

@@ -22,7 +22,7 @@ COLOURS = {
     "own": ("green: your own", "#2f7d4f"),
     "": ("grey: others", MUTED),
 }
-"""Kind of a policy -> how the caption names it, and its colour."""
+"""Kind of a policy -> its name in the caption, and its colour."""
 
 BESIDE = ((4, 4), (-4, 4), (4, -4), (-4, -4))
 AWAY = tuple(
@@ -33,13 +33,15 @@ AWAY = tuple(
         (0.3, 1), (-0.3, 1), (0.3, -1), (-0.3, -1), (1, 0.3), (-1, 0.3), (1, -0.3), (-1, -0.3),
     )
 )  # fmt: skip
-"""Where a name may stand, in printer's points from its point: at a corner of it, or else further away with a line."""
+"""Where a name may be placed, in printer's points from its point: at a corner of it, or else further away with a
+line."""
 
 ACROSS, UP = {-1: "right", 0: "center", 1: "left"}, {-1: "top", 0: "center", 1: "bottom"}
-"""Which part of a name stands nearest its point, by the direction in which it stands."""
+"""The part of a name that is nearest to its point, by the direction in which the name is placed."""
 
 NEAR, MARKER = 7, 4
-"""Pixels from another policy's point within which a name could be taken for that one's, and a line would touch it."""
+"""Distance in pixels from another policy's point within which a name could be taken for that policy's, and a line would
+touch the point."""
 
 NO_ROOM = "names that find no room are in the table"
 
@@ -100,7 +102,7 @@ def name_points(panel: Axes, points: Mapping[str, tuple[float, float]], first: S
     return [
         panel.annotate(
             ", ".join(names), point, BESIDE[0], textcoords="offset points", fontsize=7, color=INK, in_layout=False,
-            path_effects=[withStroke(linewidth=2, foreground="white")],  # lines of intervals run below it
+            path_effects=[withStroke(linewidth=2, foreground="white")],  # interval lines run below it
             arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3},
         )
         for point, names in at.items()
@@ -108,13 +110,13 @@ def name_points(panel: Axes, points: Mapping[str, tuple[float, float]], first: S
 
 
 def place(words: Sequence[Annotation], panel: Axes) -> bool:
-    """Moves each name to where it comes near no other point and covers no name before it, nor does the line to its
-    point. Hides those for which there is no such place; whether there is one for all."""
+    """Moves each name to a place where neither it nor the line to its point comes near another point or covers an
+    earlier name. Hides names without such a place; returns whether all have one."""
     points_N2 = panel.transData.transform([word.xy for word in words])
     names_K4, pixels = np.empty((0, 4)), panel.figure.dpi / 72
     for word, own in zip(words, points_N2, strict=True):
         others = points_N2[(points_N2 != own).any(1)]
-        word.set_visible(True)  # what is hidden has no size
+        word.set_visible(True)  # hidden names have no size
         size = Text.get_window_extent(word).size  # without the line
         for offset in BESIDE + AWAY:
             towards = np.sign(offset)

@@ -42,14 +42,14 @@ COMPARED = {
     "the head alone, on true frames": "true, by head",
     "control: actions of other episodes": CONTROL,
 }
-"""What is compared with the reference: success in the true world by state, or that of the real robot."""
+"""What is compared with the reference: success in the true world by state, or success of the real robot."""
 
 UNKNOWN = {"mean": None, "low": None, "high": None}
 
 
 def summarise(judged: Judgement, real: Mapping[str, Count] | None = None) -> dict[str, Any]:
-    """What agreement.json says; every number with its interval. `real`: what happened on the real robot, of some
-    policies."""
+    """The content of agreement.json: every number with its interval. `real`: the counts of some policies on the real
+    robot."""
     columns = {name: where for name, where in COLUMNS.items() if where[0] in judged.worlds}
     each = {name: successes(judged.outcomes, judged.policies, *where) for name, where in columns.items()}
     rates = {
@@ -104,7 +104,7 @@ def _alike(learned: np.ndarray, true: np.ndarray) -> dict[str, dict[str, float |
 
 
 def _plain(interval: Interval) -> dict[str, float | None]:
-    """Rounded; None where there is no telling."""
+    """The interval, rounded; None where it is unknown."""
     values = dataclasses.asdict(interval)
     kept = {key: values[key] for key in ("mean", "low", "high")}
     return {key: None if not math.isfinite(x) else round(x, 4) for key, x in kept.items()}

@@ -1,9 +1,9 @@
-"""Success rates of policies as they may truly be, given those measured at so many starts.
+"""Possible true success rates of policies, given the rates that were measured at a limited number of starts.
 
-Measured rates have the noise of their starts: it lowers correlations and disorders ranks, and resampled starts have it
-twice. Here true rates are drawn instead, from their posterior distribution: a policy's rates in the two worlds are
-normally distributed over policies, with unknown mean, spreads and correlation, and measured with normal noise. What a
-start adds to all policies of a world alike says nothing of how they differ, and is left out.
+Measured rates have the noise of their starts: it lowers correlations and disorders ranks, and resampled starts have
+this noise twice. Here true rates are drawn instead, from their posterior distribution: a policy's rates in the two
+worlds are normally distributed over policies, with unknown mean, spreads and correlation, and measured with normal
+noise. What a start adds equally to all policies of a world says nothing about how they differ, and is left out.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ SPREADS = np.geomspace(0.01, 0.5, 20)
 """Standard deviations over policies that a world may have, all of [0, 0.5] equally likely; rates cannot have more."""
 
 CORRELATIONS = np.sin(np.linspace(-0.5, 0.5, 31) * np.pi)
-"""Correlations between the rates in the two worlds, evenly spaced in their angle. All angles are equally likely, but
-for the ends."""
+"""Correlations between the rates in the two worlds, evenly spaced in their angle. All angles are equally likely, except
+the ends."""
 
 PERFECT = 0.1
-"""Probability of each end, where the rates of one world are a line of the other's. Were it below 2.5 %, intervals of
-rates that say nothing would not reach there."""
+"""Probability of each end, where the rates of one world are a linear function of the other's. If it were below 2.5 %,
+intervals of uninformative rates would not reach the ends."""
 
 
 def noise_of_starts(true_PM: np.ndarray, learned_PM: np.ndarray) -> np.ndarray:
@@ -33,19 +33,19 @@ def noise_of_starts(true_PM: np.ndarray, learned_PM: np.ndarray) -> np.ndarray:
     apart_2PM = outcomes_2PM - outcomes_2PM.mean(-1, keepdims=True)
     covariance = np.einsum("apm,bqm->abpq", apart_2PM, apart_2PM) / (starts - 1) / starts
     scale = np.einsum("ap,bq->abpq", sd_2P, sd_2P)
-    # Pooled over policies; that of different ones is of what starts have in common.
+    # Pooled over policies; the covariance between different policies comes from what starts have in common.
     own, other = (
         (covariance * which).sum((2, 3)) / (scale * which).sum((2, 3))
         for which in (np.eye(policies), 1 - np.eye(policies))
     )
-    kept = np.maximum([1 - other[0, 0], 1 - other[1, 1]], 0.05)  # of few policies `other` has errors of its own
-    # What is alike in all episodes need not be so in one more.
+    kept = np.maximum([1 - other[0, 0], 1 - other[1, 1]], 0.05)  # with few policies `other` has errors of its own
+    # Even if all episodes are alike, one more need not be.
     most = (1 - 1 / outcomes_2PM[0].size) * np.sqrt(kept.prod())
     return _covariance(sd_2P, kept, float(np.clip((own - other)[0, 1], -most, most)))
 
 
 def noise_of_counts(successes_P: np.ndarray, episodes_P: np.ndarray, learned_PM: np.ndarray) -> np.ndarray:
-    """The same where the true rates are those of other starts, so many successes of so many episodes."""
+    """The same if the true rates come from other starts, with `successes_P` in `episodes_P` episodes."""
     noise = noise_of_starts(learned_PM, learned_PM)
     noise[:, 0, 0] = _sd(successes_P, episodes_P) ** 2
     noise[:, 0, 1] = noise[:, 1, 0] = 0.0
@@ -56,7 +56,7 @@ def has_one_apart(measured_P2: np.ndarray, noise_P22: np.ndarray) -> bool:
     """Whether a policy is so far from the others, in either world, that true rates are not normally distributed.
 
     Grubbs' test (1969, "Procedures for Detecting Outlying Observations in Samples", Technometrics 11) at 5 % for both
-    worlds, but of rates with noise, of which one policy may have more than the others.
+    worlds, adapted to rates whose noise may differ between policies.
     """
     policies, noise_P2 = len(measured_P2), np.diagonal(noise_P22, axis1=1, axis2=2)
     if policies < 3:
@@ -71,7 +71,7 @@ def has_one_apart(measured_P2: np.ndarray, noise_P22: np.ndarray) -> bool:
 
 
 def draw_rates(measured_P2: np.ndarray, noise_P22: np.ndarray, draws: int) -> np.ndarray:
-    """[draws, P, 2] true rates, up to a constant of each world. They may be a little below 0 or above 1."""
+    """[draws, P, 2] true rates, up to a constant for each world. They may be slightly below 0 or above 1."""
     rng = np.random.default_rng(1)
     factor_G22, log_prior_G = _grid()
     precision_GP22 = _inverse(np.einsum("gik,gjk->gij", factor_G22, factor_G22)[:, None] + noise_P22)
@@ -105,7 +105,8 @@ def _grid() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sd(successes: np.ndarray, episodes: np.ndarray | int) -> np.ndarray:
-    """Standard error of a rate; as of half a success and half a failure more, so that it is none at 0 and 1 either."""
+    """Standard error of a rate, computed with an extra half success and half failure, so that it is not zero at 0 and
+    1."""
     rate = (successes + 0.5) / (episodes + 1)
     return np.sqrt(rate * (1 - rate) / episodes)
 

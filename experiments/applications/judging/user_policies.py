@@ -23,15 +23,15 @@ from hma_jax.simulator.robots import Robot
 SIGNATURE = "policies(robot)"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 TAKEN = re.compile(rf"{RANDOM}|{OWN_HEAD}|({'|'.join(KINDS)})-\d+")
-"""Names of policies that are made here, whichever of them there are in a judgement."""
+"""Names of policies that are made here, whichever of them a judgement has."""
 
 
 class CheckedPolicy:
-    """A user's policy: what it gives is what the protocol says, or an error that names it. It is shown copies, and what
-    it gives is copied, so that it may write into both."""
+    """A user's policy: what it returns follows the protocol, or an error names it. It receives copies, and what it
+    returns is copied, so it may write into both."""
 
     def __init__(self, policy: Policy, robot: Robot, where: str):
-        """`where`: file and name, for messages. Raises ConfigError for what is no policy."""
+        """`where`: file and name, for messages. Raises ConfigError for an object that is not a policy."""
         for method, takes, shown in (
             ("reset", {"episodes": None, "seeds": [0]}, "reset(episodes=None, *, seeds=None)"),
             ("act", {"images": None}, "act(images)"),
@@ -53,7 +53,7 @@ class CheckedPolicy:
         self.policy.reset(episodes=episodes, seeds=seeds)
 
     def act(self, images: np.ndarray) -> np.ndarray:
-        """Raises ConfigError for actions of another shape or type, and for such that are not finite."""
+        """Raises ConfigError for actions of another shape or type, and for actions that are not finite."""
         (count, robot), given = (len(images), self.robot), self.policy.act(images.copy())
         shape, chunks = (count, robot.action_dim), (count, robot.stride, robot.action_dim)
         wanted = (
@@ -81,15 +81,15 @@ class CheckedPolicy:
 
 
 def load_user_policies(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolicy], UserSuccess | None]:
-    """What `policies(robot)` of the file gives, and what it says of success, if it does. Modules beside the file can be
-    imported by it, as where it is a program.
+    """What `policies(robot)` of the file returns, and its function for success, if it has one. The file can import
+    modules beside it, as a program can.
 
-    Raises ConfigError for another thing than policies, for names that rollouts cannot be kept under, and, with its
+    Raises ConfigError for objects other than policies, for names under which rollouts cannot be kept, and, with the
     line, for what the file raises.
     """
     folder = str(path.resolve().parent)
     if folder not in sys.path:
-        sys.path.append(folder)  # behind all others: it hides none
+        sys.path.append(folder)  # after all others, so that it hides none
     with naming_line(path, PAGE):
         file = run_file(path, SIGNATURE, "policies of your own are", PAGE)
         policies = function_of(file, SIGNATURE, PAGE)(robot)
@@ -119,7 +119,7 @@ def load_user_policies(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolic
 def try_out(
     policies: dict[str, CheckedPolicy], success: UserSuccess | None, batch: int, shape: tuple[int, int]
 ) -> None:
-    """Shows each black images: what would stop it later stops it before anything is made."""
+    """Shows black images to each: an error that would stop it later stops it before anything is made."""
     black = np.zeros((batch, *shape, 3), np.uint8)
     if success is not None:
         success.probabilities(black, black)

@@ -1,5 +1,4 @@
-"""A success detector of the user: `success(images, first)` of a Python file, in place of a head that is trained
-here."""
+"""A user's success detector: `success(images, first)` of a Python file, in place of a head that is trained here."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ class UserSuccess(Head):
         self.measured: dict[str, float] = {}
 
     def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        """See `Head`. Raises ConfigError for anything but a number between 0 and 1, or a truth value, for each
+        """See `Head`. Raises ConfigError unless it returns a number between 0 and 1, or a truth value, for each
         image."""
         shape = images.shape[-3:]
         present, starts = (x.reshape(-1, *shape) for x in (images, np.broadcast_to(first, images.shape)))
@@ -51,13 +50,13 @@ class UserSuccess(Head):
             returned.shape == (len(images),) and kind, f"{wanted}; it returned {returned.dtype} {list(returned.shape)}"
         )
         values = returned.astype(np.float32)
-        inside = (values >= 0) & (values <= 1)  # of what is no number, too
+        inside = (values >= 0) & (values <= 1)  # also for values that are not numbers
         require(bool(inside.all()), f"{wanted}, in [0, 1]; it returned {values[~inside][:1]}")
         return values
 
 
 def success_of(file: types.ModuleType) -> UserSuccess | None:
-    """What a user's file says of success, or None where it says nothing. Raises ConfigError for what is no function."""
+    """The success function of a user's file, or None if it has none. Raises ConfigError if it is not a function."""
     if not hasattr(file, NAME):
         return None
     return UserSuccess(function_of(file, SIGNATURE, PAGE), str(file.__file__))

@@ -1,5 +1,5 @@
-"""The cross-entropy method (Rubinstein 1999): candidates are drawn from a normal distribution that is fitted again and
-again to the best of them."""
+"""The cross-entropy method (Rubinstein 1999): candidates are drawn from a normal distribution that is repeatedly fitted
+to the best of them."""
 
 from __future__ import annotations
 

@@ -33,14 +33,14 @@ class ActionRange:
 
     def denormalise(self, values: np.ndarray) -> np.ndarray:
         raw = self.low + (values + 1) * (self.high - self.low) / 2
-        return np.clip(raw, self.low, self.high).astype(np.float32)  # rounding takes the ends beyond the range
+        return np.clip(raw, self.low, self.high).astype(np.float32)  # rounding may take the ends beyond the range
 
 
 class Planner:
     """Plans for one episode; each search starts from the rest of the last plan."""
 
     def __init__(self, search: Search, config: SearchConfig, model: Model, robot: Robot, cost: Cost, seed: int):
-        """What is random depends on `seed` and on how many plans were made."""
+        """Random numbers depend on `seed` and on how many plans were made."""
         self._search, self._config, self._model, self._units = search, config, model, ActionRange.of(robot)
         self._cost, self._seed, self._plans = cost, seed, 0
         self._mean = np.repeat(self._units.rest[None], config.knots, 0)

@@ -38,8 +38,8 @@ def distance(images: np.ndarray, goal: np.ndarray) -> np.ndarray:
 
 
 def goal_image_cost(goal: np.ndarray) -> Cost:
-    """The mean distance from an image uint8 [H, W, C] over the second half of the horizon, which rewards to arrive
-    early and to stay. Raises ConfigError for another array; the cost does where frames have another size."""
+    """The mean distance from an image uint8 [H, W, C] over the second half of the horizon, which rewards arriving early
+    and staying. Raises ConfigError for another kind of array; the cost raises it for frames of another size."""
     goal = np.asarray(goal)
     require(
         goal.dtype == np.uint8 and goal.ndim == 3,

@@ -39,7 +39,7 @@ class Model(Protocol):
 class LearnedModel:
     """A simulator of B episodes, all of them copies of one that has seen the last `START_FRAMES` frames.
 
-    All candidates use the same random numbers, so that they differ by their actions alone. Where tokens or latents are
+    All candidates use the same random numbers, so that they differ only in their actions. If tokens or latents are
     sampled, these numbers are a function of `seed`, which is the episode's, and of the number of frames observed.
     Greedy decoding draws only the order in which tokens are unmasked: it is the same in all episodes and searches.
     """
@@ -81,7 +81,7 @@ class LearnedModel:
 
 
 class TrueModel:
-    """The true dynamics, which no planner has outside of a simulator: an upper bound for learned models."""
+    """The true dynamics, which no planner has outside a simulator: an upper bound for learned models."""
 
     def __init__(self, spec: EmbodimentSpec, robot: Robot, image_size: int):
         self._spec, self._robot, self._size = spec, robot, image_size

@@ -1,5 +1,5 @@
-"""Model-predictive path integral control (Williams et al. 2017): the mean moves to all candidates, each weighted by how
-little it costs."""
+"""Model-predictive path integral control (Williams et al. 2017): the mean moves towards all candidates, each weighted
+by how low its cost is."""
 
 from __future__ import annotations
 

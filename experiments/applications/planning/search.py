@@ -23,9 +23,9 @@ class SearchConfig:
     knots: int = 3  # K
     hold: int = 2
     spread: float = 0.7  # standard deviation of the first candidates
-    elites: int = 4  # of a batch, that the next is drawn around (CEM)
+    elites: int = 4  # candidates of a batch around which the next is drawn (CEM)
     momentum: float = 0.1  # share of the former mean and deviation that an update keeps (CEM)
-    temperature: float = 0.3  # of the weights exp(-cost / temperature), costs in their standard deviations (MPPI)
+    temperature: float = 0.3  # of the weights exp(-cost / temperature), costs in standard deviations (MPPI)
     least: float = 0.1  # no deviation becomes smaller
 
     def __post_init__(self):
@@ -67,5 +67,5 @@ def warm_start(plan: np.ndarray, config: SearchConfig, frames: int) -> np.ndarra
 
 
 def repeat_knots(plans: np.ndarray, config: SearchConfig) -> np.ndarray:
-    """[..., K, A] to an action for each frame, [..., K hold, A]."""
+    """Expands [..., K, A] to an action for each frame, [..., K hold, A]."""
     return np.repeat(plans, config.hold, axis=-2)

@@ -33,13 +33,13 @@ from data_pipelines.sources.rlds.writer import (
 from hma_jax.simulator.robots import Robot
 
 MOST_FRAMES = 3000
-"""A recording ends after so many frames: downloads of all visitors are encoded one after the other."""
+"""A recording ends after this many frames: downloads of all visitors are encoded one after the other."""
 
 MOST_BYTES = 2**26
-"""A recording also ends after so many bytes of pictures, which are kept in memory."""
+"""A recording also ends after this many bytes of images, which are kept in memory."""
 
 SHOWN = 2.0
-"""Frames per second of a video of a robot whose own time is not known."""
+"""Frames per second of a video of a robot whose own rate is unknown."""
 
 ENLARGED = 4
 """Times that a frame's sides are longer in the video."""
@@ -57,7 +57,7 @@ class Recording:
         return len(self._images)
 
     def add(self, before: np.ndarray, chunk: np.ndarray, after: np.ndarray) -> None:
-        """Adds the frame `after` [H, W, 3] the `chunk` [stride, A], the first time also the one `before`."""
+        """Adds the frame `after` [H, W, 3] the `chunk` [stride, A], and the first time also the one `before`."""
         if not self._images:
             self._images.append(encode_jpeg(before))
         self._images.append(encode_jpeg(after))
@@ -65,11 +65,11 @@ class Recording:
 
     @property
     def full(self) -> bool:
-        """Whether it takes no further frame."""
+        """Whether it takes no further frames."""
         return len(self) >= MOST_FRAMES or sum(map(len, self._images)) >= MOST_BYTES
 
     def copy(self) -> Recording:
-        """As it is now, for another thread to read, even while frames are being added or taken back."""
+        """A copy of its present state for another thread to read, even while frames are being added or taken back."""
         other = Recording(self.robot)
         images, chunks = self._images[:], self._chunks[:]
         frames = min(len(images), len(chunks) + 1)
@@ -77,22 +77,22 @@ class Recording:
         return other
 
     def drop(self, frames: int) -> None:
-        """Takes the newest frames back; all of them, if it has no more."""
+        """Removes the newest frames, or all if it has no more than these."""
         keep = len(self._images) - frames
         del self._images[max(keep, 0) :], self._chunks[max(keep - 1, 0) :]
 
     @property
     def rate(self) -> float | None:
-        """Frames per second of the robot's own time; None where it is not known."""
+        """Frames per second of the robot's own time; None if unknown."""
         return self.robot.hz / self.robot.stride or None
 
     def video(self) -> bytes:
-        """MP4, enlarged, in the robot's own time as far as it is known."""
+        """MP4, enlarged, at the robot's own rate if it is known."""
         return encode_video(map(decode_image, self._images), self.rate or SHOWN)
 
     def dataset(self) -> bytes:
         """A zip of <robot>_played/1.0.0: one episode, a step per frame with the chunk that was executed after it.
-        metadata.json says the rate where it is known."""
+        metadata.json gives the rate if it is known."""
         name = made_name(f"{self.robot.name}_played")
         height, width = decode_image(self._images[0]).shape[:2]
         chunk = self.robot.stride * self.robot.action_dim
@@ -121,7 +121,7 @@ class Recording:
 
 
 def encode_video(images: Iterable[np.ndarray], rate: float) -> bytes:
-    """MP4 of frames uint8 [H, W, 3], enlarged, `rate` of them per second. ConfigError where PyAV is missing."""
+    """MP4 of frames uint8 [H, W, 3], enlarged, `rate` of them per second. Raises ConfigError if PyAV is missing."""
     av = require_module("av", "a video")
     file = io.BytesIO()
     large = (image.repeat(ENLARGED, 0).repeat(ENLARGED, 1) for image in images)

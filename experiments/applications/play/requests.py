@@ -34,7 +34,7 @@ MAX_VALUES = 4096
 
 @dataclass(frozen=True)
 class Request:
-    """A message of a visitor, of which only the kind has been checked."""
+    """A message from a visitor; only its kind has been checked."""
 
     kind: Kind
     values: Message
@@ -43,7 +43,7 @@ class Request:
 
 @dataclass
 class Session:
-    """A visitor's episode of the simulator, and what belongs to it."""
+    """A visitor's episode in the simulator, and what belongs to it."""
 
     episode: int
     robot: Robot | None = None
@@ -54,7 +54,7 @@ class Session:
 
 
 def answer(simulator: Simulator, truth: Truth, requests: Mapping[int, tuple[Session, Request]]) -> dict[int, Message]:
-    """The reply to each visitor. A request that cannot be met is an error of that visitor's alone."""
+    """The reply to each visitor. A request that cannot be met is an error for that visitor only."""
     replies: dict[int, Message] = {}
     acting: dict[int, np.ndarray] = {}
     for visitor, (session, request) in requests.items():
@@ -133,7 +133,7 @@ def _record(simulator: Simulator, truth: Truth, session: Session, values: Messag
 
 
 def _truth(simulator: Simulator, truth: Truth, session: Session, values: Message) -> None:
-    """Both begin anew at the same start: a true state is not known of frames that the model made."""
+    """Lets both simulators begin anew at the same start: for frames that the model made, the true state is unknown."""
     require(session.robot is not None, "begin an episode first")
     on = switch(values.get("on"))
     session.truth = None
@@ -153,13 +153,13 @@ HANDLERS = {"start": _start, "rewind": _rewind, "record": _record, "truth": _tru
 
 
 def reach(simulator: Simulator, session: Session) -> int:
-    """By how many frames a visitor's episode can be rewound: no further than the true simulator beside it."""
+    """Number of frames by which a visitor's episode can be rewound: no further than the true simulator beside it."""
     most = simulator.max_rewind(session.episode)
     return most if session.truth is None else min(most, session.truth.max_rewind(0))
 
 
 def frame_of(simulator: Simulator, session: Session, request: Request) -> Message:
-    """The present frame of a visitor whose episode has begun, and where it stands."""
+    """The present frame of a visitor whose episode has begun, and its position in the episode."""
     image = simulator.images[session.episode]
     message: Message = {
         "type": "frame",
@@ -179,13 +179,14 @@ def frame_of(simulator: Simulator, session: Session, request: Request) -> Messag
     if session.truth is not None:
         true = session.truth.images[0]
         message |= {"true": picture(true), "psnr": round(float(psnr(image[None], true[None])[0]), 2)}
-    if request.kind == "rewind" or (request.kind == "truth" and session.truth is not None):  # it stands elsewhere now
+    if request.kind == "rewind" or (request.kind == "truth" and session.truth is not None):  # it is elsewhere now
         message["command"] = command(session.robot, simulator.last_action(session.episode))
     return message
 
 
 def command(robot: Robot, last: np.ndarray | None) -> list[float]:
-    """The action [A] that a page goes on with after a robot's `last`: where that was a place to go to, it stays."""
+    """The action [A] with which a page continues after a robot's `last` one: if that was a target position, it
+    stays."""
     action = last if robot.keeps and last is not None else robot.rest
     return np.clip(action, robot.low, robot.high).tolist()
 
@@ -200,9 +201,9 @@ def picture(image: np.ndarray) -> str:
 
 
 def numbers(value: Any) -> np.ndarray:
-    """ConfigError for what is no list of finite numbers."""
+    """The numbers. Raises ConfigError for anything that is not a list of finite numbers."""
     flat = isinstance(value, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
-    # A test of being finite would not do: ints may have any number of digits.
+    # isfinite would not be enough: ints may have any number of digits.
     fits = flat and len(value) <= MAX_VALUES and all(abs(v) <= LARGEST_VALUE for v in value)
     require(
         fits,
@@ -212,13 +213,13 @@ def numbers(value: Any) -> np.ndarray:
 
 
 def switch(value: Any) -> bool:
-    """ConfigError for what is neither true nor false."""
+    """The truth value. Raises ConfigError for anything that is neither true nor false."""
     require(isinstance(value, bool), f'"on" must be true or false, got {value!r:.80}')
     return value
 
 
 def whole(value: Any) -> int:
-    """ConfigError for what is no whole number from 0 to 2^32 - 1."""
+    """The number. Raises ConfigError for anything that is not a whole number from 0 to 2^32 - 1."""
     fits = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**32
     require(fits, "a whole number from 0 to 2^32 - 1 is expected")
     return value

@@ -1,4 +1,4 @@
-"""The web server of `hma play` (extra `play`): a page, what it must know, and a websocket for each visitor."""
+"""The web server of `hma play` (extra `play`): a page, the data that it needs, and a websocket for each visitor."""
 
 from __future__ import annotations
 
@@ -30,35 +30,36 @@ from hma_jax.simulator.simulator import Simulator
 log = logging.getLogger(__name__)
 
 LARGEST_MESSAGE = 2**16
-"""Bytes of a message from a visitor; a longer one ends the connection."""
+"""Largest size in bytes of a message from a visitor; a longer one ends the connection."""
 
 HEARTBEAT = 20.0
-"""Seconds between questions whether a silent visitor is still there."""
+"""Seconds between checks of whether a silent visitor is still there."""
 
 REQUEST_SECONDS = 30.0
-"""Within which a connection must have sent a whole request, its first or a further one, or it is closed; aiohttp's own
-limit is an hour. The time stands still while an answer is being written, which may be for ever."""
+"""Seconds within which a connection must have sent a whole request (its first or a further one), or it is closed;
+aiohttp's own limit is an hour. Time spent writing an answer does not count, and may be unlimited."""
 
 EXTRA_CONNECTIONS = 32
-"""Websockets beyond the number of sessions that are accepted; further ones are refused."""
+"""Number of websockets, beyond the number of sessions, that are accepted; further ones are refused."""
 
 OTHER_CONNECTIONS = 64
-"""Connections that are no websocket, of which the oldest is closed for one more: so newcomers always get in, and
-connections that send nothing, or read no answer, do not take all the file descriptors of the process."""
+"""Largest number of connections that are not websockets; for one more, the oldest is closed. So newcomers always get
+in, and connections that send nothing, or read no answer, do not take all of the process's file descriptors."""
 
 BACKLOG = 32
-"""Connections that are accepted at once. So many may come before the first of them counts."""
+"""Number of connections that are accepted at once: this many may arrive before the first of them is counted."""
 
 MAX_DOWNLOADS = 2
-"""Downloads of one visitor, one of each kind, that may be running or waiting; further ones are answered with 429."""
+"""Number of downloads of one visitor, one of each kind, that may be running or waiting; further ones are answered with
+429."""
 
 SESSIONS = web.AppKey("sessions", SessionManager)
 SOCKETS = web.AppKey("sockets", dict)
 """Websockets and the transport of each."""
 DOWNLOADS = web.AppKey("downloads", ThreadPoolExecutor)
-"""The executor of downloads. It has one thread: downloads side by side would take the cores from those who drive."""
+"""The executor of downloads. It has one thread: concurrent downloads would take cores from the visitors who drive."""
 REFUSED = web.AppKey("refused", set)
-"""Reasons of refusals that were logged: strangers cannot fill the log."""
+"""Largest number of logged reasons for refusals, so that strangers cannot fill the log."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -92,12 +93,13 @@ def make_app(
 
 
 async def require_free(host: str, port: int) -> None:
-    """Raises OSError where `serve` could not listen now."""
+    """Raises OSError if `serve` could not listen now."""
     (await asyncio.get_running_loop().create_server(asyncio.Protocol, host, port, start_serving=False)).close()
 
 
 async def serve(app: web.Application, host: str, port: int, ready: Callable[[int], None]) -> None:
-    """Serves until cancelled; `ready` is told the port, which port 0 leaves open. Raises OSError for a taken one."""
+    """Serves until cancelled; `ready` is called with the port, which the system chooses if `port` is 0. Raises OSError
+    for a port that is taken."""
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0, keepalive_timeout=REQUEST_SECONDS)
     await runner.setup()
     requests, sockets = runner.server, app[SOCKETS]
@@ -115,11 +117,11 @@ async def serve(app: web.Application, host: str, port: int, ready: Callable[[int
 def _admit(
     requests: web.Server, sockets: Mapping[web.WebSocketResponse, asyncio.Transport | None]
 ) -> web.RequestHandler:
-    """What answers a new connection. Older ones are closed so that OTHER_CONNECTIONS are no websocket."""
+    """What answers a new connection. Older ones are closed so that at most OTHER_CONNECTIONS are not websockets."""
     websockets = set(sockets.values())
     others = [c.transport for c in requests.connections if c.transport is not None and c.transport not in websockets]
     for transport in others[: max(0, len(others) + 1 - OTHER_CONNECTIONS)]:  # they are in the order of their arrival
-        transport.abort()  # one who does not read would keep a connection that is closed in peace
+        transport.abort()  # a client that does not read would keep a connection that is closed normally
     return requests()
 
 
@@ -160,8 +162,8 @@ def describe(simulator: Simulator, truth: Truth) -> list[dict]:
 def _refuse_other_names(public_names: Collection[str]) -> Callable[..., Awaitable[web.StreamResponse]]:
     """A middleware that answers 403 to requests whose Host header has a name that is not this server's.
 
-    Such a name may be that of a hostile page, made to resolve to this server's address: to the browser both are then of
-    one origin, and the page could drive and read what only this computer can reach (DNS rebinding).
+    Such a name may belong to a hostile page and be made to resolve to this server's address: to the browser both then
+    have the same origin, and the page could drive and read what only this computer can reach (DNS rebinding).
     """
     names = {"localhost", *map(name_as_sent, public_names)} - {""}
 
@@ -182,8 +184,8 @@ def _refuse_other_names(public_names: Collection[str]) -> Callable[..., Awaitabl
 
 
 def name_as_sent(name: str) -> str:
-    """As browsers write a name in the Host header: in lower case, an international one in ASCII ("xn--..."); without
-    the final dot, which counts for nothing. Empty for what is no name."""
+    """A name as browsers write it in the Host header: in lower case, an international name in ASCII ("xn--..."),
+    without the final dot, which has no meaning. Empty for anything that is not a name."""
     try:
         return URL.build(scheme="http", host=name.strip().removesuffix(".")).raw_host or ""
     except ValueError:
@@ -205,9 +207,10 @@ def _is_address(name: str) -> bool:
 
 
 def _same_origin(request: web.Request) -> bool:
-    """Whether the page that connects came from here: others must not drive what a visitor's browser can reach."""
+    """Whether the connecting page came from this server: other pages must not drive what a visitor's browser can
+    reach."""
     origin = request.headers.get("Origin")
-    return origin is None or origin.partition("://")[2] == request.host  # any text may be sent as one
+    return origin is None or origin.partition("://")[2] == request.host  # any text may be sent as an origin
 
 
 def _log_once(request: web.Request, reason: str, *values: object) -> None:
@@ -232,7 +235,7 @@ async def _drive(request: web.Request) -> web.StreamResponse:
     socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=HEARTBEAT)
     try:
         await socket.prepare(request)
-    except ConnectionError:  # whoever knocked is gone; aiohttp would log a fault of the server
+    except ConnectionError:  # the client is gone; aiohttp would log a fault of the server
         return socket
     sockets[socket] = request.transport
     try:
@@ -277,7 +280,7 @@ async def _receive(sessions: SessionManager, visitor: Visitor, socket: web.WebSo
 
 
 def _parsed(data: str) -> dict:
-    """An empty dict for what is no JSON object."""
+    """The JSON object in `data`; an empty dict if it is not one."""
     try:
         value = json.loads(data)
     except (ValueError, RecursionError):

@@ -1,8 +1,8 @@
 """Visitors of the page: their sessions in the simulator, their pending requests and the replies to be sent.
 
-Everything here runs in the event loop's thread but `requests.answer`, of which one runs at a time in another. Both
-queues are bounded: from a visitor whose requests come faster than frames are made no more is read, and one who does
-not read the replies is disconnected.
+Everything here runs in the event loop's thread except `requests.answer`, of which one call at a time runs in another
+thread. Both queues are bounded: if a visitor's requests come faster than frames are made, no more are read, and a
+visitor who does not read the replies is disconnected.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from hma_jax.simulator.simulator import Simulator
 log = logging.getLogger(__name__)
 
 MAX_PENDING_REQUESTS = 4
-"""Unanswered requests of one visitor; while there are as many, no more are read."""
+"""Largest number of unanswered requests of one visitor; while there are this many, no more are read."""
 
 MAX_PENDING_REPLIES = 16
-"""Unsent replies to one visitor; with one more the visitor is disconnected."""
+"""Largest number of unsent replies to one visitor; with one more the visitor is disconnected."""
 
 SEND_SECONDS = 10.0
-"""Within which a message must have been sent, or the visitor is disconnected."""
+"""Seconds within which a message must have been sent, or the visitor is disconnected."""
 
 PROGRESS_SECONDS = 3.0
-"""Between messages to those who wait that a round is still being computed: a page that hears nothing for three times
-as long takes its connection for lost."""
+"""Seconds between messages, to those who wait, that a round is still being computed: a page that hears nothing for
+three times as long takes its connection for lost."""
 
 CLOSE_SECONDS = 1.0
-"""Within which a page that loses its session must have been told, before its connection is closed."""
+"""Seconds within which a page that loses its session must have been told, before its connection is closed."""
 
 IDLE_SECONDS = 900.0
-"""Without a request, after which a connected visitor's session may be given to somebody else."""
+"""Seconds without a request after which a connected visitor's session may be given to somebody else."""
 
 MAX_INVALID_MESSAGES = 20
-"""Invalid messages of one connection, after which it is closed."""
+"""Number of invalid messages on one connection after which it is closed."""
 
 FAILED = "the simulator failed (see the server's log); start the episode again if it no longer moves"
 """The reply to requests that were lost by a fault of the server."""
@@ -64,13 +64,13 @@ class Visitor:
     answered: asyncio.Event = field(default_factory=asyncio.Event)
     replies: asyncio.Queue[str] | None = None  # None while not connected
     socket: web.WebSocketResponse | None = None
-    transport: asyncio.Transport | None = None  # of the socket
+    transport: asyncio.Transport | None = None  # transport of the socket
     active: float = field(default_factory=time.monotonic)
-    downloads: int = 0  # that are being made or wait
+    downloads: int = 0  # downloads that are being made or wait
     acted: int = 0  # the newest round in which an action of this visitor was executed
 
     def tell(self, message: Message) -> None:
-        """Queues a message to be sent. Where the queue is full, the visitor is disconnected."""
+        """Queues a message to be sent. If the queue is full, the visitor is disconnected."""
         if self.replies is None:
             return
         try:
@@ -81,7 +81,7 @@ class Visitor:
             self.replies = None
 
     def abort(self) -> None:
-        """Ends the connection without a closing handshake, which one who does not read would not answer."""
+        """Ends the connection without a closing handshake, which a client that does not read would not answer."""
         if self.transport is not None:
             self.transport.abort()
         self.socket = self.transport = None
@@ -96,11 +96,11 @@ async def _close_with_reason(socket: web.WebSocketResponse, transport: asyncio.T
 
 
 class SessionManager:
-    """The visitors of one simulator, whose episodes are the sessions."""
+    """The visitors of one simulator; its episodes are the sessions."""
 
     def __init__(self, simulator: Simulator, truth: Truth, max_acting: int | None = None):
-        """`max_acting`: how many may act in one round, those that programs are compiled for (default: all). May grow
-        later."""
+        """`max_acting`: how many may act in one round, limited by the batch sizes for which programs are compiled
+        (default: all). It may grow later."""
         self.simulator, self.truth = simulator, truth
         self.max_acting = len(simulator) if max_acting is None else max_acting
         self.visitors: dict[str, Visitor] = {}
@@ -128,7 +128,7 @@ class SessionManager:
         return visitor
 
     def _disconnect(self, visitor: Visitor, why: str) -> None:
-        """Tells a visitor's page, if one is connected, why its connection ends, and ends it; its pending requests are
+        """Tells a visitor's page, if one is connected, why its connection ends, and ends it. Pending requests are
         dropped."""
         if visitor.socket is not None:
             ending = asyncio.create_task(_close_with_reason(visitor.socket, visitor.transport, why))
@@ -175,8 +175,8 @@ class SessionManager:
             await visitor.answered.wait()
 
     async def serve(self) -> None:
-        """Answers requests in rounds, the oldest one of each visitor, until cancelled. A request has one reply, through
-        the connection that it came through, and none if that has ended."""
+        """Answers requests in rounds, the oldest of each visitor, until cancelled. A request gets one reply, over the
+        connection on which it came, and none if that has ended."""
         loop = asyncio.get_running_loop()
         while True:
             await self._wanted.wait()
@@ -191,20 +191,20 @@ class SessionManager:
                 while not (await asyncio.wait([made], timeout=PROGRESS_SECONDS))[0]:
                     self._report_progress(due)
                 replies = made.result()
-            except Exception:  # a fault of the server: this round's requests are lost, and it goes on
+            except Exception:  # a fault of the server: this round's requests are lost, and the server continues
                 log.exception("a round of requests could not be answered")
                 self._reset_failed()
                 replies = {i: {"type": "error", "message": FAILED} for i in requests}
             for i, message in replies.items():
                 due[i].answered.set()
-                if due[i].replies is connections[i]:  # not the one of another window
+                if due[i].replies is connections[i]:  # not the connection of another window
                     due[i].tell(message)
             if any(v.requests for v in self.visitors.values()):
                 self._wanted.set()
 
     def _next_round(self) -> list[Visitor]:
         """The visitors whose oldest request is answered next: all who have one, but at most `max_acting` of those who
-        act; these take turns."""
+        act; the latter take turns."""
         self._rounds += 1
         due = [v for v in self.visitors.values() if v.requests]
         acting = sorted((v for v in due if v.requests[0].kind == "act"), key=lambda v: v.acted)

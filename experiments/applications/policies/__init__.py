@@ -2,7 +2,7 @@
 
 `policy` says what a policy is, `tasks` what it should do, `demonstrations` are recorded episodes of the scripted
 expert, `cloning` and `diffusion` train networks on them, `kinds` is the table of these, `files` saves and loads them;
-`own_head` is HMA as a policy, `scripted` the expert itself, which sees no images but the true state.
+`own_head` is HMA as a policy, `scripted` the expert itself, which sees the true state instead of images.
 """
 
 from experiments.applications.policies.demonstrations import Demonstrations, record

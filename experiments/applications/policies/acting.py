@@ -23,14 +23,14 @@ class Scale:
 
     mean: tuple[float, ...]  # [A]
     std: tuple[float, ...]
-    low: tuple[float, ...]  # the least that was demonstrated
+    low: tuple[float, ...]  # the least value that was demonstrated
     high: tuple[float, ...]
 
     def normalise(self, actions: np.ndarray) -> np.ndarray:
         return ((actions - np.array(self.mean)) / np.array(self.std)).astype(np.float32)
 
     def raw(self, values: np.ndarray) -> np.ndarray:
-        """Within what was demonstrated."""
+        """Raw actions, limited to the demonstrated range."""
         actions = values * np.array(self.std) + np.array(self.mean)
         return np.clip(actions, self.low, self.high).astype(np.float32)
 
@@ -42,8 +42,8 @@ def scale_of(demos: Demonstrations) -> Scale:
 
 
 def make_examples(demos: Demonstrations, frames: int, chunk: int, size: int) -> dict[str, np.ndarray]:
-    """What a network is trained on: the `images` of all episodes, averaged down to `size`, and of each of the n frames
-    that count its `episode` [n], the frames `seen` by then [n, frames] and the `chunk` [n, chunk * A] of normalised
+    """What a network is trained on: the `images` of all episodes, averaged down to `size`, and for each of the n frames
+    that count, its `episode` [n], the frames `seen` by then [n, frames] and the `chunk` [n, chunk * A] of normalised
     actions from there on; the first frame is repeated before the beginning, the last action past the end."""
     episode, frame = demos.steps()
     at = np.minimum(frame[:, None] + np.arange(chunk), demos.lengths[episode][:, None] - 1)
@@ -57,7 +57,7 @@ def make_examples(demos: Demonstrations, frames: int, chunk: int, size: int) -> 
 
 
 def frames_of(examples: Mapping[str, jax.Array], index: jax.Array) -> jax.Array:
-    """[B, frames, H, W, 3] in [-1, 1]: what is seen in the examples `index` [B]."""
+    """[B, frames, H, W, 3] in [-1, 1]: the frames seen in the examples `index` [B]."""
     return as_floats(examples["images"][examples["episode"][index][:, None], examples["seen"][index]])
 
 
@@ -78,7 +78,7 @@ class ChunkConfig:
 
 
 class ChunkPolicy:
-    """A trained network that plans normalised actions, acting.
+    """A policy that acts by a trained network, which plans normalised actions.
 
     Subclasses implement the network: `plan(frames [n, frames, H, W, 3], seeds, steps)` gives [n, chunk * A].
     """
@@ -90,7 +90,7 @@ class ChunkPolicy:
         self._counts = Counts()
         self._seen: np.ndarray | None = None  # [B, frames, H, W, 3]
         self._fresh: np.ndarray | None = None  # bool [B]: the next image is the first
-        self._left: list[list[np.ndarray]] = []  # planned and not executed
+        self._left: list[list[np.ndarray]] = []  # planned but not executed
 
     def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
         self._counts.reset(episodes, seeds)

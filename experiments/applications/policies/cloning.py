@@ -1,7 +1,7 @@
 """Behaviour cloning: a small network that does what the demonstrations did, by least squares.
 
-Of imprecise actions the mean is learnt, which is precise. It sees the last `frames` images and gives a chunk of
-`chunk` actions, of which `execute` are carried out before it looks again.
+From imprecise actions it learns their mean, which is precise. It sees the last `frames` images and gives a chunk of
+`chunk` actions, of which `execute` are executed before it looks again.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class BcConfig(ChunkConfig):
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=FitConfig)
-    light: float = 0.03  # standard deviation by which the light of a training example differs, in [-1, 1]
+    light: float = 0.03  # standard deviation of the change in light of a training example, in [-1, 1]
 
 
 def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
@@ -58,7 +58,7 @@ def apply_bc(params: Params, config: BcConfig, frames: jax.Array) -> jax.Array:
 def train_bc(demos: Demonstrations, config: BcConfig, seed: int, report: Report) -> dict[int, ClonedPolicy]:
     """{step: policy} for `config.fit.keep` and the last step: from hardly trained to fully trained.
 
-    A function of its arguments; minutes on one core.
+    A pure function of its arguments; takes minutes on one core.
     """
     data = make_examples(demos, config.frames, config.chunk, config.encoder.size)
 
@@ -78,7 +78,7 @@ def _act(params: Params, config: BcConfig, images: jax.Array) -> jax.Array:
 
 
 class ClonedPolicy(ChunkPolicy):
-    """A network that `train_bc` trained, acting."""
+    """A policy that acts by a network trained by `train_bc`."""
 
     kind = "cloned"
 

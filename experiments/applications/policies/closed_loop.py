@@ -19,19 +19,19 @@ SPLIT = "closed loop"
 """Starts of these seeds are in no recording."""
 
 MOST_TRIED = 8
-"""Starts that are looked at for each that is far enough from its goal."""
+"""Number of starts that are examined for each one that is far enough from its goal."""
 
 
 class Outcome(NamedTuple):
     """How n episodes went."""
 
     success: np.ndarray  # bool [n]: the goal was held
-    distance: np.ndarray  # float [n]: from the goal at the last frame, in halves of the floor's side
+    distance: np.ndarray  # float [n]: distance from the goal at the last frame, in halves of the floor's side
 
 
 def start_seeds(task: Task, count: int, least: float = 0.0) -> np.ndarray:
-    """int64 [count]: of starts that no recording has, at least so far from the goal. More of them begin with the same
-    ones. Raises ConfigError where there are hardly any."""
+    """int64 [count]: seeds of starts that are in no recording and at least this far from the goal. A larger `count`
+    begins with the same seeds. Raises ConfigError if there are too few."""
     seeds = episode_seeds(task.spec, MOST_TRIED * count, 0, SPLIT)
     far = seeds[start_distances(task, seeds) >= least][:count]
     require(len(far) == count, f"{task.robot}: too few starts are at least {least:g} away from the goal")
@@ -44,8 +44,8 @@ def start_distances(task: Task, seeds: np.ndarray) -> np.ndarray:
 
 
 def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, stride: int = 1) -> Outcome:
-    """One episode of `task.frames` frames from each start, the first of which is the start: a goal that is reached
-    there counts. A function of its arguments."""
+    """Runs one episode of `task.frames` frames from each start. The first frame is the start, and a goal that is
+    reached there counts. A pure function of its arguments."""
     world, looks = World(task.spec, seeds), draw_appearance(task.spec, seeds)
     reached = []
     policy.reset(seeds=[int(seed) % 2**32 for seed in seeds])
@@ -61,7 +61,7 @@ def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, s
 
 
 def goal_distance(world: World) -> np.ndarray:
-    """float [n]: the distance from the goal; of a robot's own task, that of the farthest tool from its mark."""
+    """float [n]: the distance from the goal; for a robot's own task, that of the farthest tool from its mark."""
     task = world.spec.task
     if isinstance(task, ReachMark):
         return task.distance(world)

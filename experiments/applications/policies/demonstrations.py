@@ -1,4 +1,4 @@
-"""Recorded episodes as arrays: what policies and success heads are trained on."""
+"""Recorded episodes as arrays, on which policies and success heads are trained."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hma_jax.config import require
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
 
 SPLIT = "demonstrations"
-"""Their seeds are those of no episode that a world model is trained or judged on."""
+"""Their seeds differ from those of all episodes on which a world model is trained or judged."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Demonstrations:
         return len(self.images)
 
     def take(self, rows: np.ndarray | slice | Sequence[int]) -> Demonstrations:
-        """Some of the episodes."""
+        """A selection of the episodes."""
         return Demonstrations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def steps(self) -> tuple[np.ndarray, np.ndarray]:
@@ -67,12 +67,12 @@ def record(
     only_successes: bool = False,
     seed: int = 0,
 ) -> Demonstrations:
-    """`count` episodes of the scripted expert, of `task.frames` frames each, a function of the arguments.
+    """`count` episodes of the scripted expert, of `task.frames` frames each; a pure function of the arguments.
 
-    Of several `noise`s every one makes an equal share. The actions are those that were executed, the imprecise ones.
-    `play`: restless behaviour instead of the expert. `after`: so many frames after it succeeded an
-    episode ends (None: at its full length). `only_successes` leaves failures out; episodes are then drawn until there
-    are enough. Raises ConfigError if the expert hardly ever succeeds.
+    Several `noise` values get equal shares. The actions are the imprecise ones that were executed. `play`: restless
+    behaviour instead of the expert. `after`: an episode ends this many frames after it succeeded (None: at its full
+    length). `only_successes` leaves failures out; episodes are then drawn until there are enough. Raises ConfigError if
+    the expert hardly ever succeeds.
     """
     noises = [noise] if isinstance(noise, (int, float)) else list(noise)
     counts = [count // len(noises) + (i < count % len(noises)) for i in range(len(noises))]
@@ -108,7 +108,7 @@ def _finished(task: Task, driven: ExpertRollouts, seeds: np.ndarray, after: int 
 
 
 def save_demonstrations(demos: Demonstrations, path: Path) -> None:
-    """Compressed, whole or not at all."""
+    """Writes the demonstrations, compressed, completely or not at all."""
     write_arrays(path, vars(demos))
 
 

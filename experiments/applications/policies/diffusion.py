@@ -1,4 +1,4 @@
-"""Diffusion Policy, small: a chunk of actions is drawn by denoising, given what is seen (Chi et al. 2023).
+"""A small Diffusion Policy: a chunk of actions is drawn by denoising, given the observed frames (Chi et al. 2023).
 
 The encoder is that of `cloning`; the denoiser is a network on the whole chunk instead of a U-Net over its steps.
 Training adds noise of one of `levels` strengths (squared-cosine schedule) and predicts that noise or the clean chunk;
@@ -38,14 +38,14 @@ EMBEDDED = 32
 """Values that a noise level is given as: sines and cosines."""
 
 SPREAD = 3.0
-"""Standard deviations of the demonstrated actions, for the limits of this name."""
+"""Number of standard deviations of the demonstrated actions, for the limits of this name."""
 
 Predicts = Literal["noise", "chunk"]
 """What the denoiser is trained to predict."""
 
 Limits = Literal["range", "spread"]
-"""Beyond what no action is denoised to: the range of the demonstrated ones, or SPREAD, beyond which lies, for example,
-the action of a gripper that is closed in few frames."""
+"""Limits beyond which no action is denoised: the range of the demonstrated actions, or SPREAD. Beyond SPREAD is, for
+example, the action of a gripper that is closed in few frames."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,8 @@ def _act(params: Params, config: DiffusionConfig, images: jax.Array, start: jax.
 
 
 class DiffusionPolicy(ChunkPolicy):
-    """A network that `train_diffusion` trained, acting. What it draws is a function of the episode's seed and step."""
+    """A policy that acts by a network trained by `train_diffusion`. What it draws is a function of the episode's seed
+    and step."""
 
     kind = "diffusion"
 

@@ -1,4 +1,4 @@
-"""Experts and play in the true simulator of a task: what was seen, done and reached, of whole batches of episodes."""
+"""Experts and play in the true simulator of a task: what was seen, done and reached, for whole batches of episodes."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ class ExpertRollouts(NamedTuple):
 
     images: np.ndarray  # uint8 [n, F, H, W, 3]
     actions: np.ndarray  # float32 [n, F, A], raw
-    reached: np.ndarray  # bool [n, F]: the goal, at this frame
+    reached: np.ndarray  # bool [n, F]: the goal is reached at this frame
 
 
 def new_episodes(task: Task, count: int, seed: int, split: str) -> np.ndarray:
-    """int64 [count]: the seeds of a split's episodes. More of them begin with the same ones."""
+    """int64 [count]: the seeds of a split's episodes. A larger `count` begins with the same seeds."""
     if task.in_suite:
         return episode_seeds(task.spec, count, seed, split)
     return new_seeds(task.robot, count, seed, split)
 
 
 def drive(task: Task, seeds: np.ndarray, stride: int, image_size: int, *, noise: float, play: bool) -> ExpertRollouts:
-    """`task.frames` frames from each start, a function of the arguments; an action is held for `stride` native
-    steps."""
+    """Runs `task.frames` frames from each start; a pure function of the arguments. An action is held for `stride`
+    native steps."""
     kind = _drive_suite if task.in_suite else _drive_physics
     return kind(task, seeds, stride, image_size, noise, play)
 
@@ -68,8 +68,8 @@ def _drive_suite(
 def _drive_physics(
     task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool
 ) -> ExpertRollouts:
-    """The expert of `hma data sim`, but it looks once a frame, has no lapses, and its errors have a correlation time of
-    `JITTER` frames instead of 0.1 s. With `play` actions wander around rest."""
+    """Uses the expert of `hma data sim`, but it looks once per frame, has no lapses, and its errors have a correlation
+    time of `JITTER` frames instead of 0.1 s. With `play`, actions wander around rest."""
     spec, world = task.physics, PhysicsWorld(task.physics, image_size)
     shape = len(seeds), task.frames
     images = np.zeros((*shape, image_size, image_size, 3), np.uint8)

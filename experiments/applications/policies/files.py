@@ -25,7 +25,7 @@ DESCRIPTION, WEIGHTS = "policy.json", "weights.safetensors"
 
 
 def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] | None = None) -> None:
-    """Replaces `directory`, whole or not at all. `about` stands in its description: robot, task, step, seed."""
+    """Replaces `directory`, completely or not at all. `about` is added to its description: robot, task, step, seed."""
     making = directory.with_name(f".{directory.name}.{secrets.token_hex(4)}.tmp")
     making.mkdir(parents=True)
     try:
@@ -43,7 +43,7 @@ def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] |
 
 
 def load_policy(directory: Path) -> ChunkPolicy:
-    """Raises ConfigError where none is, or a damaged one."""
+    """Loads a policy. Raises ConfigError if there is none, or it is damaged."""
     try:
         description = json.loads((directory / DESCRIPTION).read_text())
         weights = load_file(directory / WEIGHTS)
@@ -64,7 +64,7 @@ def named(params: Any) -> dict[str, np.ndarray]:
 
 
 def unnamed(arrays: Mapping[str, np.ndarray], like: Any, where: Path) -> Any:
-    """The tree of `like` with these arrays. Raises ConfigError for others than it has."""
+    """The tree of `like` with these arrays. Raises ConfigError if they are not the arrays that it has."""
     shapes = {jax.tree_util.keystr(path): x.shape for path, x in jax.tree.leaves_with_path(like)}
     found = {name: x.shape for name, x in arrays.items()}
     require(shapes == found, f"{where}: the weights do not fit the network in its description; train the policy again")

@@ -29,7 +29,7 @@ class Kind:
     # train(demonstrations, config, seed, report): {step: policy} for the steps of its `fit` to keep, and the last one
     train: Callable[[Demonstrations, Any, int, Report], Mapping[int, ChunkPolicy]]
     explained: str  # on the page of a judgement
-    legend: str  # what a figure calls all of the kind, after its colour's name
+    legend: str  # a figure's name for all of this kind, after the colour's name
     colour: str
 
 
@@ -43,5 +43,5 @@ KINDS = {
         ),
     )
 }  # fmt: skip
-"""By name. Each has a field in `LadderConfig` and an option of `hma judge` of this name: how many checkpoints of it are
-judged."""
+"""The kinds by name. Each has a field in `LadderConfig` and an option of `hma judge` with this name: how many of its
+checkpoints are judged."""

@@ -21,7 +21,7 @@ Report = Callable[[int, int, str], None]
 @dataclass(frozen=True)
 class FitConfig:
     """AdamW with a warm-up and a cosine decay, float32. Parameters are kept after each of the steps `keep`, and after
-    the last one: their exponential moving average where `ema` > 0."""
+    the last one; if `ema` > 0, their exponential moving average."""
 
     steps: int = 3000
     batch: int = 64
@@ -48,9 +48,9 @@ def fit(
     seed: int,
     report: Report,
 ) -> dict[int, Any]:
-    """{step: parameters} of every step that is kept, the last included.
+    """{step: parameters} for every step that is kept, including the last.
 
-    `loss(params, data, index [B], key)` is the mean over the examples `index` of `data`, which lies whole in memory.
+    `loss(params, data, index [B], key)` is the mean over the examples `index` of `data`, all of which is in memory.
     Step n draws its batch from `fold_in(key(seed), n)`. The average of parameters forgets the first ones sooner.
     """
     schedule = optax.warmup_cosine_decay_schedule(

@@ -1,8 +1,9 @@
 """Small networks on images, as functions of dictionaries of arrays: what policies and success heads share.
 
 Frames are averaged down to `size` and become K points: where each of the last convolution's maps is strongest, by a
-spatial softmax (Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies"), and how strong it is there.
-What finds a mark at one place then finds it anywhere; a dense layer on the maps learns every place by itself.
+spatial softmax (Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies"), and how strong it is there. A
+network that finds a mark at one place then finds it anywhere; a dense layer on the maps would have to learn every place
+separately.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ Params = dict[str, Any]
 
 
 STRIDED_LAYERS = 2
-"""Convolutions of stride 2, which come first; those after them have stride 1."""
+"""Number of convolutions with stride 2, which come first; those after them have stride 1."""
 
 SHARPNESS = 3.0
-"""What a map's values are multiplied by before the softmax, at the beginning of training."""
+"""Factor on a map's values before the softmax, at the beginning of training."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class EncoderConfig:
 
     @property
     def features(self) -> int:
-        """Values that `encode` gives for an image."""
+        """Number of values that `encode` gives for an image."""
         return 3 * self.channels[-1]
 
 
@@ -59,7 +60,7 @@ def dense(params: Params, x: jax.Array) -> jax.Array:
 
 
 def init_mlp(key: jax.Array, widths: tuple[int, ...]) -> list[Params]:
-    """The last layer begins small."""
+    """Parameters of an MLP; the last layer starts small."""
     keys, last = jax.random.split(key, len(widths) - 1), len(widths) - 2
     return [init_dense(k, widths[i], widths[i + 1], 0.1 if i == last else 2.0) for i, k in enumerate(keys)]
 
@@ -71,7 +72,7 @@ def mlp(layers: list[Params], x: jax.Array) -> jax.Array:
 
 
 def init_encoder(key: jax.Array, config: EncoderConfig, inputs: int) -> Params:
-    """For images of `inputs` channels."""
+    """Parameters of an encoder for images with `inputs` channels."""
     widths, kernels = (inputs, *config.channels), (5, *(3,) * (len(config.channels) - 1))
     keys = jax.random.split(key, len(kernels))
     convolutions = [
@@ -117,7 +118,7 @@ def require_multiples(height: int, width: int, size: int) -> None:
 
 
 def downsample(images: jax.Array, size: int) -> jax.Array:
-    """[B, size, size, C]: means of squares of pixels. Raises ConfigError where they do not divide."""
+    """[B, size, size, C]: means over square blocks of pixels. Raises ConfigError if the sizes do not divide."""
     batch, height, width, channels = images.shape
     require_multiples(height, width, size)
     if (height, width) == (size, size):
@@ -141,13 +142,13 @@ def jitter_colour(frames: jax.Array, key: jax.Array, strength: float) -> jax.Arr
 
 
 def random_shift(frames: jax.Array, key: jax.Array, most: int) -> jax.Array:
-    """Random shifts: frames [B, n, H, W, 3], of each example all n moved alike by up to `most` pixels; edges are
-    repeated."""
+    """Random shifts: frames [B, n, H, W, 3]; all n frames of an example are moved together by up to `most` pixels, and
+    edges are repeated."""
     if not most:
         return frames
     wide = jnp.pad(frames, ((0, 0), (0, 0), (most, most), (most, most), (0, 0)), mode="edge")
     place = jax.random.randint(jax.random.fold_in(key, 1), (len(frames), 2), 0, 2 * most + 1, jnp.int32)
-    start = jnp.pad(place, ((0, 0), (1, 1)))  # of all images and colours
+    start = jnp.pad(place, ((0, 0), (1, 1)))  # for all images and colours
     return jax.vmap(lambda x, at: jax.lax.dynamic_slice(x, at, frames.shape[1:]))(wide, start)
 
 

@@ -1,7 +1,7 @@
-"""HMA itself as a policy: its action head reads the next chunk off the frames it sees, as long as one likes.
+"""HMA itself as a policy: its action head predicts the next chunk from the frames it sees, for any number of frames.
 
-Past the model's window the oldest frame and its action are forgotten. Needs a run that was trained to
-predict actions; the models of this repository were not (`experiments.applications.own_policy` trains one on).
+Past the model's window the oldest frame and its action are forgotten. Needs a run that was trained to predict actions;
+the models of this repository were not (`experiments.applications.own_policy` trains one further for this).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class OwnHeadPolicy:
         self.tokenizer, self.robot, self.frames = tokenizer, robot, model.config.frames
         self.width = model.table.action_width
         self._embodiment, self._params, self._counts = model.table.index(robot.name), model.params, Counts()
-        self._tokens: list[list[np.ndarray]] = []  # of each episode, at most T
-        self._chunks: list[list[np.ndarray]] = []  # between them
+        self._tokens: list[list[np.ndarray]] = []  # frames of each episode, at most T
+        self._chunks: list[list[np.ndarray]] = []  # actions between them
 
         decode = DecodeConfig()
 

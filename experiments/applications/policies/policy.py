@@ -11,18 +11,18 @@ from hma_jax.simulator.robots import Robot
 
 
 class Policy(Protocol):
-    """Acts in B episodes of one robot, and remembers of each what it needs of its past."""
+    """Acts in B episodes of one robot, and remembers what it needs from each episode's past."""
 
     def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
         """`episodes` (None: all) begin anew: the next image of each is its first.
 
-        What is random of an episode is a function of its seed (None: its number) and of how many actions it has had.
+        Random numbers of an episode are a function of its seed (None: its number) and of how many actions it has had.
         """
         ...
 
     def act(self, images: np.ndarray) -> np.ndarray:
         """Actions float32 in the robot's raw units, after images uint8 [B, H, W, 3]: for each frame of the model one
-        [B, A], held for it, or its whole chunk [B, stride, A]."""
+        action [B, A], held for the frame, or its whole chunk [B, stride, A]."""
         ...
 
 
@@ -49,7 +49,7 @@ class Counts:
 
 
 class RandomPolicy:
-    """Uniform within the robot's range, each action held for `hold` frames: looks at nothing."""
+    """Actions that are uniform within the robot's range, each held for `hold` frames; images are ignored."""
 
     def __init__(self, robot: Robot, hold: int = 3):
         self.robot, self.hold = robot, hold

@@ -1,5 +1,5 @@
-"""The scripted expert of the suite, with adjustable noise. It sees the true state, so it can act in the true simulator
-alone, and there is no such thing in a learned one."""
+"""The scripted expert of the suite, with adjustable noise. It sees the true state, which a learned simulator does not
+have, so it can act only in the true simulator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from experiments.applications.policies.tasks import Task
 
 
 def make_expert(world: World, seed: int) -> Behaviour:
-    """Steers `world` to its task's goal and stays there; its imprecision is the noise of the world's spec."""
+    """An expert that steers `world` to its task's goal and stays there; its imprecision is the noise of the world's
+    spec."""
     return Behaviour(world, np.random.default_rng([seed, len(world), 12]), expert=True)
 
 

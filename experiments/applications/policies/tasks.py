@@ -1,4 +1,4 @@
-"""Tasks of policies, and when they succeed: of robots with a true simulator by its state, of others by recordings."""
+"""Tasks of policies, and when they succeed: by the state for robots with a true simulator, by recordings for others."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ OWN, REACH, HOVER = "own", "reach", "hover"
 TASKS = (OWN, REACH, HOVER)
 
 EXPERTS = {name: spec for name, spec in PHYSICS.items() if spec.success and spec.expert}
-"""Robots of physics simulators that say when their one task is done, and of which there is an expert."""
+"""Robots of physics simulators that report when their single task is done, and for which there is an expert."""
 
 ROBOTS = (*SPECS, *EXPERTS)
 """All that have a task."""
 
 PHYSICS_FRAMES = 24
-"""Half as many again as an undisturbed expert takes to open the drawer, at 4 frames a second. Of other robots and rates
-nothing was measured: give `frames`."""
+"""One and a half times as many as an undisturbed expert takes to open the drawer, at 4 frames a second. Other robots
+and rates were not measured: give `frames`."""
 
 RADIUS = 0.22
-"""Within which a tool has reached the mark, in halves of the floor's side: a little less than the mark's own."""
+"""Distance within which a tool has reached the mark, in halves of the floor's side: a little less than the mark's own
+radius."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class HoverPuck(ReachMark):
     """The first tool above the puck that is nearest to it, its gripper open; for robots that pass above things."""
 
     within: float = 0.3  # a little more than a puck's radius
-    step: float = 0.4  # that the expert moves the tool at once, world units
+    step: float = 0.4  # largest distance that the expert moves the tool at once, world units
 
     def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         target, move = scene.tools.copy(), self._move(scene)
@@ -98,12 +99,13 @@ class Task:
 
     @property
     def in_suite(self) -> bool:
-        """Whether the task is of a robot of the suite, not of a physics simulator."""
+        """Whether the task's robot is from the suite, not from a physics simulator."""
         return self.robot in SPECS
 
     @property
     def spec(self) -> EmbodimentSpec:
-        """The suite's robot with this task. Only what counts as done differs from its own: frames look the same."""
+        """The suite's robot with this task. It differs from the robot's own spec only in what counts as done: frames
+        look the same."""
         require(self.in_suite, f"{self.robot} is a robot of a physics simulator, whose task only `hma judge` supports")
         spec = SPECS[self.robot]
         if self.name == OWN:
@@ -118,7 +120,7 @@ class Task:
 
     @property
     def goal(self) -> str:
-        """In words."""
+        """The goal in words."""
         if not self.in_suite:
             return instruction(self.physics, self.physics.envs[0])
         if self.name != OWN:
@@ -128,13 +130,13 @@ class Task:
 
 @dataclass(frozen=True)
 class RecordedTask:
-    """What a robot without a true simulator is to do, as its recordings show it; otherwise as `Task`."""
+    """What a robot without a true simulator has to do, as shown by its recordings; otherwise like `Task`."""
 
     robot: str
     frames: int = 0  # 0: as long as most of the recorded successes
     hold: int = 2
-    reward: float | None = None  # from which on a step has reached the goal; None: their ends alone say it
-    goal: str = ""  # in words, where the recordings have some
+    reward: float | None = None  # least reward of a step that has reached the goal; None: only their ends say it
+    goal: str = ""  # in words, if the recordings have some
     name: str = "recorded"
 
     def __post_init__(self):
@@ -150,7 +152,7 @@ AnyTask = Task | RecordedTask
 
 
 def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int | None = None) -> Task:
-    """A task with its usual length, unless another is given. Raises ConfigError for one that there is not."""
+    """A task with its usual length, unless another is given. Raises ConfigError for a task that does not exist."""
     task = Task(robot, name)
     usual_frames = Task.frames if task.in_suite else PHYSICS_FRAMES
     # A tool that wanders passes over the mark; one that was steered there stays.
@@ -159,13 +161,13 @@ def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int 
 
 
 def join(parts: Sequence[Arrays]) -> Arrays:
-    """Several dataclasses of arrays, each with a row for every episode, as one of all their episodes."""
+    """Several dataclasses of arrays, each with a row per episode, joined into one with all episodes."""
     names = [f.name for f in fields(parts[0])]
     return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def world_of(spec: EmbodimentSpec, states: Sequence[State]) -> World:
-    """A world that goes on from these states."""
+    """A world that continues from these states."""
     state = join(states)
     world = World(spec, state.seeds)
     world.state = state
@@ -174,5 +176,5 @@ def world_of(spec: EmbodimentSpec, states: Sequence[State]) -> World:
 
 def held(reached_NL: np.ndarray, hold: int) -> np.ndarray:
     """bool [N, L]: the goal was reached at this frame and the hold - 1 before it."""
-    padded = np.pad(reached_NL, ((0, 0), (hold, 0)))  # by one more than is needed: there may be no frame
+    padded = np.pad(reached_NL, ((0, 0), (hold, 0)))  # one longer than needed: there may be no frame
     return sliding_window_view(padded, hold, axis=1).all(-1)[:, 1:]
