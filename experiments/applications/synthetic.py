@@ -353,7 +353,7 @@ def main() -> None:
     written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
     write_settings(out, run, simulator, settings)
     shortest = data["recorded"].lengths[:2].min()
-    kinds = [kind for kind in data if kind != JUDGED_ON]
+    kinds = [kind for kind in (*KINDS, PASSIVE_KIND) if kind in data]
     draw_strips([data[kind].images[:2, :shortest] for kind in kinds], kinds, out / "frames.png")
     wrote(*written, out / "frames.png")
 

@@ -43,7 +43,7 @@ def draw_conditions(
 
 
 def wrapped(name: str) -> str:
-    for words in (" generated", " without", " first"):
+    for words in (" generated", " without", " first", " only"):
         name = name.replace(words, "\n" + words[1:])
     return name.replace(", ", ",\n")
 

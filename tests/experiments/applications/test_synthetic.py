@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from dataclasses import fields, replace
@@ -16,6 +15,7 @@ from scipy import stats
 
 from data_pipelines.suite.generate import generate_suite
 from experiments.analysis.bootstrap import bootstrap_intervals
+from experiments.analysis.intervals import Interval
 from experiments.applications import DRIVEN, FIRST, plan_actions, synthetic
 from experiments.applications.generating import conditions
 from experiments.applications.generating.conditions import (
@@ -466,46 +466,89 @@ def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(n
     assert conditions.markdown(summary_of(name, FIRST)) in (ROOT / "docs" / "generating.md").read_text()
 
 
-@pytest.mark.parametrize("name", ["synthetic_given", "synthetic_pusher"])
-def test_what_following_actions_is_worth_is_as_the_page_says(name):
-    """Success of policies on data of a model with actions and of one without, paired by seed, with Student's t."""
-    with open(RESULTS / name / "trials.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    seeds = sorted({row["seed"] for row in rows})
+def said(mean: float, low: float, high: float) -> str:
+    return f"{mean:.2f} ({low:.2f} to {high:.2f})"
 
-    def rates(name: str) -> np.ndarray:
-        own = [row for row in rows if row["condition"] == name]
-        return np.array([np.mean([row["success"] == "1" for row in own if row["seed"] == seed]) for seed in seeds])
 
-    gain = rates(CONDITIONS[MOST].name) - rates(CONDITIONS[PASSIVE].name)
+def page() -> str:
+    """In one line."""
+    return " ".join((ROOT / "docs" / "generating.md").read_text().split())
+
+
+def worth(name: str, control: int, what: str = "success") -> str:
+    """What policies on generated data have more of than those of a control, paired by seed, with Student's t."""
+    trials = conditions.read_trials(RESULTS / name)
+    seeds = sorted(seed for i, seed in trials if i == MOST)
+    gain = np.array([np.mean(trials[MOST, s][what]) - np.mean(trials[control, s][what]) for s in seeds])
     half = stats.t.ppf(0.975, len(seeds) - 1) * gain.std(ddof=1) / len(seeds) ** 0.5
-    page = " ".join((ROOT / "docs" / "generating.md").read_text().split())
     assert len(seeds) == 12
-    assert f"worth {gain.mean():.2f} ({gain.mean() - half:.2f} to {gain.mean() + half:.2f}) of success" in page
+    return said(gain.mean(), gain.mean() - half, gain.mean() + half)
 
 
-def test_how_soon_the_task_of_the_recorded_frames_is_done_is_as_the_page_says():
-    settings = from_settings(Settings, RESULTS / "synthetic_pusher" / "settings.json")
+@pytest.mark.parametrize("name", ["synthetic_given", "synthetic_pusher", "synthetic_night"])
+def test_what_following_actions_is_worth_is_as_the_page_says(name):
+    assert f"Following actions is worth {worth(name, PASSIVE)} of success" in page()
+
+
+def test_what_generated_frames_add_to_the_recorded_ones_is_as_the_page_says():
+    assert f"The generated frames are worth {worth('synthetic_given', GIVEN)} of success" in page()
+    one, two, served = (
+        worth(name, GIVEN) for name in ("synthetic_night", "synthetic_night_two", "grown_night_through")
+    )
+    assert f"worth {one} of success after one recorded frame and {two} after two" in page()
+    assert (
+        f"{served} after one and {worth('grown_night_two', GIVEN)} after two" in page()
+        and f"so generated frames are worth {served} of success" in page()
+    )
+    assert f"in action error they do: {worth('synthetic_night_two', GIVEN, 'error')}" in page()
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence", "frames"),
+    [
+        ("synthetic_pusher", "{} % of the tools are on the mark in the third frame, {} % in the fourth", (2, 3)),
+        ("synthetic_given", "{} % of gripper_wood's tools are above their puck in the third frame", (2,)),
+        ("synthetic_night", "{}, {} and {} % of its tools are there in the first three frames", (0, 1, 2)),
+    ],
+)
+def test_how_soon_the_task_of_the_recorded_frames_is_done_is_as_the_page_says(name, sentence, frames):
+    settings = from_settings(Settings, RESULTS / name / "settings.json")
     (robot,) = (one for one in load_robots(FIRST / ROBOTS) if one.name == settings.robot)
-    reached = ScriptedSource(settings, robot, 32).record().reached
-    third, fourth = 100 * reached[:, settings.given - 1 : settings.given + 1].mean(0)
-    page = " ".join((ROOT / "docs" / "generating.md").read_text().split())
-    assert f"{third:.0f} % of the tools are on the mark in the third frame, {fourth:.0f} % in the fourth" in page
+    reached = 100 * ScriptedSource(settings, robot, 32).record().reached.mean(0)
+    assert sentence.format(*(f"{reached[t]:.0f}" for t in frames)) in page()
+
+
+def side_by_side(ways: list[list[conditions.Summary]], what: str) -> str:
+    """Rows of a table of the page: every condition and share of the first of several runs, in all of them."""
+    others = [{one.name: one.measured[what] for one in way} for way in ways]
+
+    def cell(r: Interval | None) -> str:
+        return said(r.mean, r.low, r.high) if r else "–"
+
+    return "\n".join(f"| {one.name} | {' | '.join(cell(o.get(one.name)) for o in others)} |" for one in ways[0])
 
 
 def test_what_the_served_model_s_trajectories_are_worth_is_as_the_page_says():
     """Success under three ways to begin side by side, and the shares of the gap in the error of actions."""
-    page = (ROOT / "docs" / "generating.md").read_text()
     ways = [summary_of(f"synthetic_grown{end}", DRIVEN) for end in ("", "_given", "_three")]
-
-    def said(summary: conditions.Summary, what: str) -> str:
-        r = summary.measured[what]
-        return f"{r.mean:.2f} ({r.low:.2f} to {r.high:.2f})"
-
-    rows = [f"| {row[0].name} | {' | '.join(said(one, 'success') for one in row)} |" for row in zip(*ways, strict=True)]
-    assert "\n".join(rows) in page
+    assert side_by_side(ways, "success") in (ROOT / "docs" / "generating.md").read_text()
     closed = [next(s for s in way if s.name == "share of the gap: 10 + 90 generated") for way in ways]
-    assert ", ".join(said(one, "error") for one in closed) in " ".join(page.split())
+    assert ", ".join(said(r.mean, r.low, r.high) for r in (one.measured["error"] for one in closed)) in page()
+
+
+NIGHT = {
+    "synthetic_night": FIRST,
+    "synthetic_night_two": FIRST,
+    "synthetic_night_through": FIRST,
+    "grown_night_through": DRIVEN,
+    "grown_night_two": DRIVEN,
+}
+
+
+@pytest.mark.parametrize("what", ["success", "error"])
+def test_what_trajectories_are_worth_that_outlast_their_recorded_frames_is_as_the_page_says(what):
+    ways = [summary_of(name, model) for name, model in NIGHT.items()]
+    assert side_by_side(ways, what) in (ROOT / "docs" / "generating.md").read_text()
 
 
 @pytest.mark.parametrize(
