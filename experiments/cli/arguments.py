@@ -47,8 +47,8 @@ class ReplaceArguments:
     """Results made with other settings or data are replaced only on request."""
 
     replace: Annotated[Step | None, arg(metavar="STEP"), UNSET] = None
-    """Redo this step and those that depend on it, and replace results made with other settings or data. The steps in
-    order: suite, tokenizer, tokens, windows, study."""
+    """Redo this step and those that depend on it, and replace results made with other settings or data.
+    The steps in order: suite, tokenizer, tokens, windows, study."""
 
 
 @dataclass(frozen=True)
