@@ -45,8 +45,8 @@ class RunOptions:
     """Steps between evaluations of the loss on held-out windows; 0: none.
     They are written to RUN/validation.jsonl."""
     trace: Annotated[int | None, arg(metavar="STEPS"), UNSET] = None
-    """Record a profile of this many steps with JAX's profiler, after the first ten, in RUN/profile
-    (docs/performance.md)."""
+    """Record a profile of this many steps with JAX's profiler, after the first ten steps.
+    It is written to RUN/profile (docs/performance.md)."""
 
     def check(self) -> None:
         """Raises ConfigError for invalid values, naming the options of the command line."""
