@@ -58,12 +58,8 @@ FEW, MOST, CONTROL, ALL, PASSIVE, GIVEN = 0, 3, 4, 5, 6, 7
 """Indices in `CONDITIONS` of those that shares of the gap are computed from."""
 CONTROLS = (CONTROL, PASSIVE, GIVEN)
 
-SHARES = {
-    MOST: "10 + 90 generated",
-    CONTROL: "other actions",
-    PASSIVE: "a model without actions",
-    GIVEN: "recorded first frames only",
-}
+SHARES = {i: CONDITIONS[i].name.removeprefix("10 + 90, ") for i in (MOST, *CONTROLS)}
+"""What each share is called."""
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan, math.nan)
 

@@ -14,7 +14,15 @@ import pytest
 
 from data_pipelines.suite.environment import Environment
 from experiments.applications import plan_actions
-from experiments.applications.plan_actions import PLANNERS, Settings, besides_settings, draw, goal_image, summarise
+from experiments.applications.plan_actions import (
+    PLANNERS,
+    Settings,
+    besides_settings,
+    decided,
+    draw,
+    goal_image,
+    summarise,
+)
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import ActionRange, Planner
 from experiments.applications.planning.goals import block_means, goal_image_cost
@@ -350,3 +358,22 @@ def test_models_are_planned_in_at_one_temperature_whatever_their_own(tmp_path, m
         said = json.loads((out / "settings.json").read_text())
         found.append((said["temperature"], said["simulator"]["decode"]["temperature"]))
     assert found == [(0, 0), (0, 0), (0.5, 0.5)]
+
+
+def test_an_episode_ends_when_nothing_can_change_its_outcome():
+    task = find_task("pusher_sand", "reach", frames=16, hold=6)
+    assert decided([False] * 4 + [True] * 6, task) and not decided([False] * 4 + [True] * 5, task)
+    assert decided([False] * 11, task) and not decided([False] * 10, task)
+    assert not decided([False] * 10 + [True] * 5, task) and decided([False] * 10 + [True, False], task)
+
+
+def test_a_plan_is_not_carried_out_for_longer_than_it_is_nor_searched_among_too_few(monkeypatch):
+    assert Settings(execute=6).search.frames == 6
+    with pytest.raises(ConfigError, match="--execute must lie in 1..6, the frames of a plan, got 7"):
+        Settings(execute=7)
+    with pytest.raises(ConfigError, match="--frames must be more than the 6 in a row at the goal .*; got 6"):
+        Settings(frames=6)  # nothing was planned, and the seconds of a plan were no number
+    assert not decided([False], Settings(frames=7).make_task())
+    monkeypatch.setattr(sys, "argv", ["plan_actions", "nowhere", "--candidates", "2"])
+    with pytest.raises(ConfigError, match="--candidates must be at least 4, got 2"):
+        plan_actions.main()

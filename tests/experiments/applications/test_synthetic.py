@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from data_pipelines.suite.generate import generate_suite
 from experiments.analysis.bootstrap import bootstrap_intervals
-from experiments.analysis.intervals import Interval
-from experiments.applications import DRIVEN, FIRST, plan_actions, synthetic
+from experiments.applications import synthetic
 from experiments.applications.generating import conditions
 from experiments.applications.generating.conditions import (
     ALL,
@@ -31,31 +29,22 @@ from experiments.applications.generating.conditions import (
 )
 from experiments.applications.generating.demonstration_sources import (
     RecordedSource,
-    ScriptedSource,
     Settings,
     Training,
     shuffled_actions,
 )
 from experiments.applications.generating.reconstruction import ThroughTokenizer, reconstruct_recorded
 from experiments.applications.generating.trajectories import open_trajectories
-from experiments.applications.plan_actions import decided
 from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig
 from experiments.applications.policies.demonstrations import Demonstrations, save_demonstrations
 from experiments.applications.policies.network import EncoderConfig
-from experiments.applications.policies.tasks import find_task
-from experiments.applications.settings_file import hash_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.synthetic import choose, make_data, run_trial
 from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
-from hma_jax.config.json import from_dict
-from hma_jax.simulator.folder import DECODE, ROBOTS, change_decode, load_robots, save_decode
+from hma_jax.simulator.folder import DECODE, change_decode, save_decode
 from hma_jax.simulator.robots import Robot
-from hma_jax.training.runs import load_model
 from tests.experiments.applications.runs import TABLE, make_run
-
-ROOT = Path(__file__).parents[3]
-RESULTS = ROOT / "experiments" / "results"
 
 
 def demonstrations(kind: int, count: int = 100) -> Demonstrations:
@@ -420,149 +409,3 @@ def test_other_actions_are_another_trajectorys_and_a_shorter_ones_last_is_held()
     np.testing.assert_allclose(
         shuffled_actions(demos)[..., 0], [[2, 2.1, 2.1], [0, 0.1, 0.2], [1, 1.1, 1.2]], rtol=1e-6
     )
-
-
-def test_an_episode_ends_when_nothing_can_change_its_outcome():
-    task = find_task("pusher_sand", "reach", frames=16, hold=6)
-    assert decided([False] * 4 + [True] * 6, task) and not decided([False] * 4 + [True] * 5, task)
-    assert decided([False] * 11, task) and not decided([False] * 10, task)
-    assert not decided([False] * 10 + [True] * 5, task) and decided([False] * 10 + [True, False], task)
-
-
-def test_a_plan_is_not_carried_out_for_longer_than_it_is_nor_searched_among_too_few(monkeypatch):
-    assert plan_actions.Settings(execute=6).search.frames == 6
-    with pytest.raises(ConfigError, match="--execute must lie in 1..6, the frames of a plan, got 7"):
-        plan_actions.Settings(execute=7)
-    with pytest.raises(ConfigError, match="--frames must be more than the 6 in a row at the goal .*; got 6"):
-        plan_actions.Settings(frames=6)  # nothing was planned, and the seconds of a plan were no number
-    assert not decided([False], plan_actions.Settings(frames=7).make_task())
-    monkeypatch.setattr(sys, "argv", ["plan_actions", "nowhere", "--candidates", "2"])
-    with pytest.raises(ConfigError, match="--candidates must be at least 4, got 2"):
-        plan_actions.main()
-
-
-def from_settings(kind: type, path: Path, model: Path = FIRST):
-    values = json.loads(path.read_text())
-    assert values.pop("run") == model.name
-    assert values.pop("weights") == hash_of(load_model(model).params)
-    values.pop("simulator", None)  # files that were written before it was kept lack it
-    assert set(values) <= {f.name for f in fields(kind)}  # nor do they have fields that came later
-    return from_dict(kind, values)
-
-
-def summary_of(name: str, model: Path) -> list[conditions.Summary]:
-    """Of committed trials, which `name`/table.md shows."""
-    place = RESULTS / name
-    settings, trials = from_settings(Settings, place / "settings.json", model), conditions.read_trials(place)
-    assert set(trials) == {(i, s) for i in conditions.tried_conditions(trials) for s in settings.seeds}
-    assert settings.starts >= 50 and len(settings.seeds) >= 3
-    found = conditions.summarise(trials, settings.seeds)
-    assert conditions.markdown(found) == (place / "table.md").read_text()
-    return found
-
-
-@pytest.mark.parametrize("name", ["synthetic", "synthetic_given", "synthetic_pusher"])
-def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(name):
-    assert conditions.markdown(summary_of(name, FIRST)) in (ROOT / "docs" / "generating.md").read_text()
-
-
-def said(mean: float, low: float, high: float) -> str:
-    return f"{mean:.2f} ({low:.2f} to {high:.2f})"
-
-
-def page() -> str:
-    """In one line."""
-    return " ".join((ROOT / "docs" / "generating.md").read_text().split())
-
-
-def worth(name: str, control: int, what: str = "success") -> str:
-    """What policies on generated data have more of than those of a control, paired by seed, with Student's t."""
-    trials = conditions.read_trials(RESULTS / name)
-    seeds = sorted(seed for i, seed in trials if i == MOST)
-    gain = np.array([np.mean(trials[MOST, s][what]) - np.mean(trials[control, s][what]) for s in seeds])
-    half = stats.t.ppf(0.975, len(seeds) - 1) * gain.std(ddof=1) / len(seeds) ** 0.5
-    assert len(seeds) == 12
-    return said(gain.mean(), gain.mean() - half, gain.mean() + half)
-
-
-@pytest.mark.parametrize("name", ["synthetic_given", "synthetic_pusher", "synthetic_night"])
-def test_what_following_actions_is_worth_is_as_the_page_says(name):
-    assert f"Following actions is worth {worth(name, PASSIVE)} of success" in page()
-
-
-def test_what_generated_frames_add_to_the_recorded_ones_is_as_the_page_says():
-    assert f"The generated frames are worth {worth('synthetic_given', GIVEN)} of success" in page()
-    one, two, served = (
-        worth(name, GIVEN) for name in ("synthetic_night", "synthetic_night_two", "grown_night_through")
-    )
-    assert f"worth {one} of success after one recorded frame and {two} after two" in page()
-    assert (
-        f"{served} after one and {worth('grown_night_two', GIVEN)} after two" in page()
-        and f"so generated frames are worth {served} of success" in page()
-    )
-    assert f"in action error they do: {worth('synthetic_night_two', GIVEN, 'error')}" in page()
-
-
-@pytest.mark.parametrize(
-    ("name", "sentence", "frames"),
-    [
-        ("synthetic_pusher", "{} % of the tools are on the mark in the third frame, {} % in the fourth", (2, 3)),
-        ("synthetic_given", "{} % of gripper_wood's tools are above their puck in the third frame", (2,)),
-        ("synthetic_night", "{}, {} and {} % of its tools are there in the first three frames", (0, 1, 2)),
-    ],
-)
-def test_how_soon_the_task_of_the_recorded_frames_is_done_is_as_the_page_says(name, sentence, frames):
-    settings = from_settings(Settings, RESULTS / name / "settings.json")
-    (robot,) = (one for one in load_robots(FIRST / ROBOTS) if one.name == settings.robot)
-    reached = 100 * ScriptedSource(settings, robot, 32).record().reached.mean(0)
-    assert sentence.format(*(f"{reached[t]:.0f}" for t in frames)) in page()
-
-
-def side_by_side(ways: list[list[conditions.Summary]], what: str) -> str:
-    """Rows of a table of the page: every condition and share of the first of several runs, in all of them."""
-    others = [{one.name: one.measured[what] for one in way} for way in ways]
-
-    def cell(r: Interval | None) -> str:
-        return said(r.mean, r.low, r.high) if r else "–"
-
-    return "\n".join(f"| {one.name} | {' | '.join(cell(o.get(one.name)) for o in others)} |" for one in ways[0])
-
-
-def test_what_the_served_model_s_trajectories_are_worth_is_as_the_page_says():
-    """Success under three ways to begin side by side, and the shares of the gap in the error of actions."""
-    ways = [summary_of(f"synthetic_grown{end}", DRIVEN) for end in ("", "_given", "_three")]
-    assert side_by_side(ways, "success") in (ROOT / "docs" / "generating.md").read_text()
-    closed = [next(s for s in way if s.name == "share of the gap: 10 + 90 generated") for way in ways]
-    assert ", ".join(said(r.mean, r.low, r.high) for r in (one.measured["error"] for one in closed)) in page()
-
-
-NIGHT = {
-    "synthetic_night": FIRST,
-    "synthetic_night_two": FIRST,
-    "synthetic_night_through": FIRST,
-    "grown_night_through": DRIVEN,
-    "grown_night_two": DRIVEN,
-}
-
-
-@pytest.mark.parametrize("what", ["success", "error"])
-def test_what_trajectories_are_worth_that_outlast_their_recorded_frames_is_as_the_page_says(what):
-    ways = [summary_of(name, model) for name, model in NIGHT.items()]
-    assert side_by_side(ways, what) in (ROOT / "docs" / "generating.md").read_text()
-
-
-@pytest.mark.parametrize(
-    ("name", "model"),
-    [
-        ("planning", FIRST),
-        ("planning_weighed", FIRST.with_name("simulator_weighed")),
-        ("planning_grown", DRIVEN),
-        ("planning_more", DRIVEN),
-    ],
-)
-def test_the_committed_table_of_planners_follows_from_its_trials(name, model):
-    place = RESULTS / name
-    settings = from_settings(plan_actions.Settings, place / "settings.json", model)
-    trials = plan_actions.read_trials(place / "trials.csv")
-    assert {len(found) for found in trials.values()} == {settings.starts} and settings.starts >= 30
-    assert plan_actions.markdown(plan_actions.summarise(trials)) == (place / "table.md").read_text()
