@@ -18,7 +18,7 @@ from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import DIVERGED, FINISHED, MISSING, PREEMPTED, REFUSED, Ledger
 from experiments.running.provenance import Provenance, trial_closure
-from experiments.running.runner import Job, run_missing
+from experiments.running.runner import Job, TrialsFailed, run_missing
 from experiments.running.shared_runs import latest_common, share_runs
 from experiments.running.slots import find_accelerators
 from experiments.running.subprocess_call import call_in_subprocess
@@ -40,14 +40,6 @@ from hma_jax.runtime.locks import EXPIRES, Lock, find_held, machine
 
 POLL_SECONDS = 1.0
 """Seconds between two checks of whether a lease is over."""
-
-
-class TrialsFailed(Exception):
-    """The sweep ran to its end, but some trials have no result. `exit`: the command's exit code."""
-
-    def __init__(self, message: str, exit: Exit = Exit.FAILED):
-        super().__init__(message)
-        self.exit = exit
 
 
 def run_study(

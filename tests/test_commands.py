@@ -14,7 +14,7 @@ import re
 import shlex
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +23,7 @@ from tyro.extras import SubcommandApp
 from experiments.cli import main as program
 from experiments.presets import PRESETS, get_preset
 from experiments.user_input.override import override
+from tests.experiments.programs import command_of, run_program
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -78,24 +79,31 @@ def commands(kind) -> list[str]:
 # --- What a command line says ----------------------------------------------------------------
 
 
-@pytest.fixture
-def parsed(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
-    """What the commands of `hma` were called with; none of them does anything."""
-    calls: list[dict] = []
+def recorder(calls: list[dict]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Makes of a command one that only adds its arguments to `calls`."""
 
-    def recorder(function):
+    def change(function):
         @functools.wraps(function)
         def record(**arguments):
             calls.append(arguments)
 
         return record
 
+    return change
+
+
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
+    """What the commands of `hma` were called with; none of them does anything."""
+    calls: list[dict] = []
+    record = recorder(calls)
+
     def record_all(app: SubcommandApp) -> None:
         for spec in app._subcommands.values():
             if isinstance(spec.target, SubcommandApp):
                 record_all(spec.target)
             else:
-                monkeypatch.setattr(spec, "target", recorder(spec.target))
+                monkeypatch.setattr(spec, "target", record(spec.target))
 
     record_all(program.app)
     return calls
@@ -117,7 +125,7 @@ def complaint(command: str, calls: list[dict], capsys, *, whole: bool) -> str | 
             unknown = [extra for extra in extras if not re.search(rf"^{extra} = \[", known, re.MULTILINE)]
             return f"no extra {', '.join(unknown)}" if unknown else None
         case ["python", "-m", module, *arguments]:
-            return _complaint_of_module(module, arguments, calls, capsys)
+            return _complaint_of_module(module, arguments, calls, capsys, whole)
     return "no command that this test knows"
 
 
@@ -132,14 +140,8 @@ def _complaint_of_hma(arguments: list[str], calls: list[dict], capsys, whole: bo
         capsys.readouterr()
         return "there is no such command" if end.value.code else None
     calls.clear()
-    try:
-        code = program.main(arguments)
-    except SystemExit as end:
-        code = end.code
-    said = " ".join(re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().err).split())
-    if code:
-        missing = "equired" in said and "nrecognized" not in said and "invalid" not in said.lower()
-        return None if missing and not whole else said
+    if said := _refusal(lambda: program.main(arguments), capsys, whole):
+        return said
     given = calls[-1].get("arguments") if calls else None
     if given is not None and given.set:
         with contextlib.suppress(SystemExit):  # of --set help
@@ -147,7 +149,18 @@ def _complaint_of_hma(arguments: list[str], calls: list[dict], capsys, whole: bo
     return None
 
 
-def _complaint_of_module(module: str, arguments: list[str], calls: list[dict], capsys) -> str | None:
+def _refusal(run: Callable[[], int | None], capsys, whole: bool) -> str | None:
+    """What a program said that refused its arguments; None if it took them, or misses some and need not be `whole`."""
+    try:
+        code = run()
+    except SystemExit as end:
+        code = end.code
+    said = " ".join(re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().err).split())
+    missing = "equired" in said and "nrecognized" not in said and "invalid" not in said.lower()
+    return said if code and (whole or not missing) else None
+
+
+def _complaint_of_module(module: str, arguments: list[str], calls: list[dict], capsys, whole: bool) -> str | None:
     if module == "pytest":
         missing = [word for word in arguments if not word.startswith("-") and not (ROOT / word).exists()]
         return f"no {', '.join(missing)}" if missing else None
@@ -159,6 +172,8 @@ def _complaint_of_module(module: str, arguments: list[str], calls: list[dict], c
     text = Path(found.origin).read_text()
     if axis := re.search(r'run_sweep\("(\w+)"\)', text):
         return _complaint_of_hma(["sweep", axis[1], *arguments], calls, capsys, True)
+    if command_of(Path(found.origin)):
+        return _refusal(lambda: run_program(module, arguments, recorder(calls)), capsys, whole)
     unknown = [word for word in arguments if word.startswith("--") and f'"{word}"' not in text]
     return f"{module} does not take {', '.join(unknown)}" if unknown else None
 
@@ -193,6 +208,9 @@ def test_every_command_in_backticks_parses(parsed, capsys):
         ("python -m tests.stress.tokenize_kills --kill 3", "--kill"),
         ("python -m tests.stress.nothing", "no module"),
         ("python -m experiments.sweeps.width --dry-runs", "--dry-runs"),
+        ("python -m experiments.applications.endurance RUN --drives behaviour extremes", None),
+        ("python -m experiments.applications.endurance RUN --drives fast", "fast"),
+        ("python -m experiments.applications.detector", "equired"),
     ],
 )
 def test_what_is_wrong_is_found(command, wrong, parsed, capsys):

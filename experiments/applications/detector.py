@@ -13,19 +13,19 @@ it was stopped (its frames are drawn again, in a minute or two), and keeps an ex
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from tyro.conf import Positional, arg
 
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
@@ -35,6 +35,7 @@ from experiments.applications.scenes import Points, Scenes, draw_scenes, point_n
 from experiments.applications.settings_file import FILE, pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
+from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import say, short, step, wrote
 from hma_jax.config import ConfigError, require
@@ -278,25 +279,33 @@ def make_detector(robots: Sequence[str], tokenizer: Tokenizer, out: Path) -> Det
     return detector
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, default=OUT)
-    args = parser.parse_args()
-    simulator, weights, table = load_simulator(args.run), args.out / WEIGHTS, args.out / ERRORS
+def train_for_run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")], out: Annotated[Path, arg(metavar="DIR")] = OUT
+) -> None:
+    """Trains a detector for the robots of a run.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory for the detector.
+    """
+    simulator, weights, table = load_simulator(run), out / WEIGHTS, out / ERRORS
     robots = list(suite_robots(simulator.robots))
     require(
-        not weights.exists() or (args.out / FILE).exists(),
+        not weights.exists() or (out / FILE).exists(),
         f"{weights} exists, but it is not known for which run it was trained; choose another --out or remove it",
     )
-    pin_settings(args.out, args.run, simulator, unused=("simulator.decode",))  # no frame is made
+    pin_settings(out, run, simulator, unused=("simulator.decode",))  # no frame is made
     if existing := weights.exists():
         say(f"{short(weights)} of this run exists already; remove it to train it again")
     else:
-        make_detector(robots, simulator.tokenizer, args.out)
+        make_detector(robots, simulator.tokenizer, out)
     print(table.read_text())
-    then = f"python -m experiments.applications.endurance {args.run} --detector {weights}"
+    then = f"python -m experiments.applications.endurance {run} --detector {weights}"
     wrote(*(() if existing else (weights, table)), then=then)
+
+
+def main() -> None:
+    run_module(train_for_run, __doc__)
 
 
 if __name__ == "__main__":

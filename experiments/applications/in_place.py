@@ -4,20 +4,21 @@ Cost: half an hour of one core for forty robots, most of it the detector, which 
 Expected: things that moved are found within 2 pixels (of 32) of their true place in most last frames of a model that
           follows actions, and in almost none of a still picture.
 
-Held-out episodes of every robot that the suite can simulate continue from a prompt of `START_FRAMES` frames to the end
-of the model's window, under the recorded actions, in the learned and in the true simulator. Blur costs little PSNR but
+Held-out episodes of every robot that the suite can simulate continue from their first frames to the end of the
+model's window, under the recorded actions, in the learned and in the true simulator. Blur costs little PSNR but
 much of this share. Writes DIR/in_place.csv, a row for each thing that is seen at the end, and the detector, if it does
 not exist yet.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from tyro.conf import Positional, arg
 
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.true_simulator import TrueSimulator
@@ -38,6 +39,8 @@ from experiments.applications.scenes import Points, point_names, points_of
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import START_FRAMES, held_out, load_simulator, true_simulator
 from experiments.applications.tables import write_rows
+from experiments.running.run_options import UNSET
+from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import console, step, wrote
 from hma_jax.config import ExecutionConfig, require
@@ -106,36 +109,46 @@ def in_place(rows: Sequence[Row], view: str) -> tuple[float, float, int]:
     return over_robots(near, "near")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, default=Path("runs/in_place"))
-    parser.add_argument("--robots", nargs="+", default=(), metavar="NAME", help="only these; all that the suite knows")
-    args = parser.parse_args()
+def measure_run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/in_place"),
+    robots: Annotated[tuple[str, ...], arg(metavar="NAME ..."), UNSET] = (),
+) -> None:
+    """Measures a run, and trains the detector for it.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory for the table and the detector.
+        robots: Only these robots; without it all robots of the run that the suite can simulate.
+    """
     options = {"execution": ExecutionConfig(remat="none"), "episodes": EPISODES, "history": 1}
-    simulator = load_simulator(args.run, **options)
-    robots, weights = select_robots(suite_robots(simulator.robots), args.robots), args.out / WEIGHTS
-    settings = {"robots": sorted(robots)} if args.robots else {}
-    pin_settings(args.out, args.run, simulator, settings)  # a detector is trained on frames as one tokenizer shows them
+    simulator = load_simulator(run, **options)
+    chosen, weights = select_robots(suite_robots(simulator.robots), robots), out / WEIGHTS
+    settings = {"robots": sorted(chosen)} if robots else {}
+    pin_settings(out, run, simulator, settings)  # a detector is trained on frames as one tokenizer shows them
     if not weights.exists():
-        make_detector(list(robots), simulator.tokenizer, args.out)
+        make_detector(list(chosen), simulator.tokenizer, out)
     detector, rows, short = Detector.load(weights), [], []
     with step("held-out episodes") as update:
-        for i, robot in enumerate(robots.values()):
+        for i, robot in enumerate(chosen.values()):
             new = measure_ends(simulator, detector, robot)
             short += [] if new else [robot.name]
             rows += new
-            update(i + 1, len(robots), robot.name)
+            update(i + 1, len(chosen), robot.name)
     if short:
         console.print(f"left out, since their episodes are too short or show no object at the end: {', '.join(short)}")
     require(bool(rows), "no robot is left; choose other --robots, or a model with a shorter window")
-    write_rows(args.out / TABLE, rows)
+    write_rows(out / TABLE, rows)
     for kind, prefix in (("tools and objects", ""), ("tools", "tool"), ("objects", "colour")):
         own_rows = [row for row in rows if str(row["what"]).startswith(prefix)]
         shares = {view: in_place(own_rows, view) for view in VIEWS}
         words = [f"{view} {share:.3f} ± {half:.3f}" for view, (share, half, _) in shares.items()]
         console.print(f"{kind} that moved, in place ({shares['true'][2]} robots): {', '.join(words)}", soft_wrap=True)
-    wrote(args.out / TABLE)
+    wrote(out / TABLE)
+
+
+def main() -> None:
+    run_module(measure_run, __doc__)
 
 
 if __name__ == "__main__":

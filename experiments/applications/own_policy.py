@@ -17,16 +17,16 @@ run, the post-trained model, and its tokenizer: a policy, no longer a simulator.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
+from typing import Annotated
 
 import jax
 import numpy as np
+from tyro.conf import Positional, arg
 
 from experiments.applications import FIRST
 from experiments.applications.judging.agreement import rate_interval
@@ -47,10 +47,11 @@ from experiments.applications.policies.tasks import Task, find_task
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import make_once, write_table
+from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import step, wrote
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig, require
-from hma_jax.config.base import later
+from hma_jax.config.base import later, require_choice
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, path_name
 from hma_jax.runtime.files import write_file
@@ -64,6 +65,7 @@ from hma_jax.training.train import train_model
 OUT = Path("runs/own_policy")
 OWN, CLONED, DIFFUSION, RANDOM = "HMA's own action head", "behaviour cloning", "Diffusion Policy", "random actions"
 POLICIES = OWN, CLONED, DIFFUSION, RANDOM
+ALL = f"(default: all: {', '.join(POLICIES)})"
 NAMES = ("policy", "start", "success", "distance")
 
 
@@ -238,26 +240,39 @@ def write_results(trials: Mapping[str, list[tuple[bool, float]]], out: Path) -> 
     print(markdown(summary))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, nargs="?", default=FIRST, help="directory of a training run")
-    parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--steps", type=int, default=Settings.steps, help="of training, of every policy")
-    parser.add_argument("--starts", type=int, default=Settings.starts)
-    parser.add_argument("--demonstrations", type=int, default=Settings.demonstrations, help="episodes of the expert")
-    parser.add_argument(
-        "--predicts", choices=get_args(Predicts), default=Settings.predicts, help="what the Diffusion Policy predicts"
-    )
-    parser.add_argument(
-        "--limits", choices=get_args(Limits), default=Settings.limits, help="of the Diffusion Policy's actions"
-    )
-    parser.add_argument(
-        "--policies", nargs="+", default=POLICIES, choices=POLICIES, metavar="POLICY", help=f"of: {', '.join(POLICIES)}"
-    )
-    args = vars(parser.parse_args())
-    run, out, policies = args.pop("run"), args.pop("out"), args.pop("policies")
-    write_results(compare(run, out, Settings(**args), policies), out)
+def compare_in_run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")] = FIRST,
+    out: Annotated[Path, arg(metavar="DIR")] = OUT,
+    steps: int = Settings.steps,
+    starts: int = Settings.starts,
+    demonstrations: int = Settings.demonstrations,
+    predicts: Predicts = Settings.predicts,
+    limits: Limits = Settings.limits,
+    policies: Annotated[tuple[str, ...], arg(metavar="POLICY ...", help_behavior_hint=ALL)] = POLICIES,
+) -> None:
+    """Trains the policies and runs them in the true simulator.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory for everything that is written.
+        steps: Training steps of each policy.
+        starts: Number of starts, the same for every policy.
+        demonstrations: Episodes of the scripted expert that the policies are trained on.
+        predicts: What the Diffusion Policy's network predicts: the noise, or the chunk of actions without noise.
+        limits: Limits of the Diffusion Policy's actions. range: the smallest and largest demonstrated values. spread:
+            three standard deviations.
+        policies: Policies to compare, each in quotation marks.
+    """
+    require(bool(policies), "--policies needs at least one name")
+    for policy in policies:
+        require_choice(policy, POLICIES, "--policies")
+    settings = Settings(steps=steps, starts=starts, demonstrations=demonstrations, predicts=predicts, limits=limits)
+    write_results(compare(run, out, settings, policies), out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md")
+
+
+def main() -> None:
+    run_module(compare_in_run, __doc__)
 
 
 if __name__ == "__main__":

@@ -20,15 +20,16 @@ policy or of random actions with the last frame.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import sys
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from tyro.conf import Positional, arg
 
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.suite.environment import Environment
@@ -53,9 +54,11 @@ from experiments.applications.policies.tasks import Task, find_task, held, world
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import make_once, write_table
+from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import require
+from hma_jax.config.base import require_choice
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
@@ -72,6 +75,7 @@ PLANNERS: dict[str, tuple[Search, str]] = {
 CLONED = {f"behaviour cloning of {n} trajectories": n for n in (100, 1000)}
 RANDOM = "random actions"
 WAYS = (*PLANNERS, *CLONED, RANDOM)
+ALL = f"(default: all: {', '.join(WAYS)})"
 NAMES = ["way", "start", "success", "distance", "seconds_per_plan"]
 
 
@@ -284,37 +288,63 @@ def draw(summary: Sequence[tuple[str, Interval, float]], path: Path) -> None:
         save(figure, path)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, nargs="?", default=FIRST, help="directory of a training run")
-    parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--robot", default=Settings.robot)
-    parser.add_argument("--task", default=Settings.task, help="reach, or own: what the robot's own recordings do")
-    parser.add_argument("--frames", type=int, default=Settings.frames, help="of an episode")
-    parser.add_argument("--starts", type=int, default=Settings.starts)
-    parser.add_argument("--skip", type=int, default=Settings.skip, help="starts before the first that is taken")
-    parser.add_argument("--seed", type=int, default=Settings.seed, help="of the training of the cloned policies")
-    parser.add_argument(
-        "--ways", nargs="+", default=WAYS, choices=WAYS, metavar="WAY", help=f"of acting, of: {', '.join(WAYS)}"
-    )
-    parser.add_argument("--execute", type=int, default=Settings.execute, help="frames from one plan to the next")
-    parser.add_argument("--candidates", type=int, default=SearchConfig.candidates)
-    parser.add_argument("--iterations", type=int, default=SearchConfig.iterations)
-    parser.add_argument("--unmask-steps", type=int, default=Settings.unmask_steps, help="looks at a frame")
-    parser.add_argument(
-        "--temperature",
-        type=float,
-        default=Settings.temperature,
-        help="at which tokens or latents are sampled; 0: greedy",
-    )
-    args = vars(parser.parse_args())
-    run, out, wanted = args.pop("run"), args.pop("out"), args.pop("ways")
+def plan_in_run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")] = FIRST,
+    out: Annotated[Path, arg(metavar="DIR")] = OUT,
+    robot: str = Settings.robot,
+    task: Literal["own", "reach", "hover"] = Settings.task,
+    frames: int = Settings.frames,
+    starts: int = Settings.starts,
+    skip: int = Settings.skip,
+    seed: int = Settings.seed,
+    ways: Annotated[tuple[str, ...], arg(metavar="WAY ...", help_behavior_hint=ALL)] = WAYS,
+    execute: int = Settings.execute,
+    candidates: int = SearchConfig.candidates,
+    iterations: int = SearchConfig.iterations,
+    unmask_steps: Annotated[int, arg(name="unmask-steps", metavar="M")] = Settings.unmask_steps,
+    temperature: float = Settings.temperature,
+) -> None:
+    """Plans in a model and in the true simulator, and compares how often the goal is reached.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory for everything that is written.
+        robot: One of the model's robots, with a true simulator.
+        task: own: the robot's own task. reach: bring the tool to the mark. hover: hold the tool above a puck.
+        frames: Length of an episode, in frames of the model.
+        starts: Number of starts, the same for every way of acting.
+        skip: Starts to leave out before the first, for others than an earlier run had.
+        seed: Random seed of the cloned policies' training.
+        ways: Ways of acting to compare, each in quotation marks.
+        execute: Frames from one plan to the next.
+        candidates: Sequences of actions that the model predicts in one batch.
+        iterations: Batches of sequences for a plan.
+        unmask_steps: Unmasking steps per frame; more are slower.
+        temperature: Temperature at which tokens or latents are sampled; 0: greedy decoding.
+    """
+    require(bool(ways), "--ways needs at least one name")
+    for way in ways:
+        require_choice(way, WAYS, "--ways")
     fewest = SearchConfig.elites  # whom CEM draws around
-    require(args["candidates"] >= fewest, f"--candidates must be at least {fewest}, got {args['candidates']}")
-    search = SearchConfig(candidates=args.pop("candidates"), iterations=args.pop("iterations"))
-    settings = Settings(search=search, **args)
-    write_results(compare(run, out, settings, wanted), out)
+    require(candidates >= fewest, f"--candidates must be at least {fewest}, got {candidates}")
+    settings = Settings(
+        robot=robot,
+        task=task,
+        frames=frames,
+        starts=starts,
+        skip=skip,
+        execute=execute,
+        unmask_steps=unmask_steps,
+        temperature=temperature,
+        search=SearchConfig(candidates=candidates, iterations=iterations),
+        seed=seed,
+    )
+    write_results(compare(run, out, settings, ways), out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
+
+
+def main() -> None:
+    run_module(plan_in_run, __doc__)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Makes the model of `make play` small enough for the repository, and measures its quality.
 
 Command: hma train --preset play --out runs/play
-         python -m experiments.applications.ship runs/play/model --out runs/shipped --unmask-steps 8 --temperature 0.7
+Command: python -m experiments.applications.ship runs/play/model --out runs/shipped --unmask-steps 8 --temperature 0.7
 Cost: the first an hour and a half of one core, including its tokenizer, resumed where it was stopped; the second three
       minutes. For the served model: docs/simulator.md.
 Expected: frames under held-out actions are nearer to the truth than the last frame repeated, and than frames under
@@ -9,30 +9,31 @@ Expected: frames under held-out actions are nearer to the truth than the last fr
 
 Writes weights (in half precision; their average, if the run keeps one), tokenizer, the robots' commands, starts of
 held-out episodes, how frames are filled, and report.json: PSNR against the true simulator by frame, for the model, a
-still picture and shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch 1.
+still picture and shuffled actions, over held-out episodes of each robot; frames per second at batch 1.
 clip.gif shows the first of these episodes.
 """
 
 from __future__ import annotations
 
-import argparse
 import io
 import json
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
 from PIL import Image
+from tyro.conf import Positional, arg
 
 from data_pipelines.publishing.files import publish
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
 from experiments.applications.simulators import held_out, in_suite, load_simulator, save_beside, true_simulator
 from experiments.bench.simulate import time_simulator
 from experiments.running.machine import describe_machine
+from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
@@ -200,15 +201,25 @@ def describe(run: Path) -> None:
     print(f"{report['frames_per_second']} frames/s at batch 1; step {report['step']:,}")
 
 
+def ship_run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    unmask_steps: Annotated[int, arg(name="unmask-steps", metavar="M")] = DEFAULT_DECODE.unmask_steps,
+    temperature: float = DEFAULT_DECODE.temperature,
+) -> None:
+    """Makes a run small enough for the repository, and describes it.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory for the model. If it holds one, that is replaced.
+        unmask_steps: Unmasking steps per frame; more are slower.
+        temperature: Temperature at which tokens or latents are sampled; 0: greedy decoding.
+    """
+    ship(run, out, change_decode(DEFAULT_DECODE, temperature, unmask_steps=unmask_steps), describe)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, required=True, help="directory that is replaced")
-    parser.add_argument("--unmask-steps", type=int, default=DEFAULT_DECODE.unmask_steps, help="passes over a frame")
-    parser.add_argument("--temperature", type=float, default=DEFAULT_DECODE.temperature, help="of drawing tokens")
-    args = parser.parse_args()
-    decode = change_decode(DEFAULT_DECODE, args.temperature, unmask_steps=args.unmask_steps)
-    ship(args.run, args.out, decode, describe)
+    run_module(ship_run, __doc__)
 
 
 if __name__ == "__main__":

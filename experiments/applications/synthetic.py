@@ -25,13 +25,14 @@ trajectory; summary.csv and table.md; synthetic.png; frames.png.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from data_pipelines.publishing.files import remove
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
@@ -78,7 +79,8 @@ from experiments.applications.settings_file import pin_settings, write_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import make_once, write_table
 from experiments.running.workspace import Workspace
-from experiments.study_setup import use_entries
+from experiments.study_setup import UNSET, use_entries
+from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
 from hma_jax.config import DecodeConfig, require
@@ -251,33 +253,59 @@ def quality_of(data: Mapping[str, Demonstrations], given: int) -> dict[str, tupl
     return quality
 
 
-def make_source(args: argparse.Namespace, simulator: Simulator) -> DemonstrationSource:
+def by_default(value: object) -> Any:
+    """For an option of which it matters whether it was given: its help says what holds otherwise."""
+    return arg(help_behavior_hint=f"(default: {value})")
+
+
+@dataclass(frozen=True)
+class DemonstrationArguments:
+    """Where demonstrations come from: a scripted expert, or with `actions` recordings. Options of the other kind of
+    source are refused."""
+
+    robot: Annotated[str | None, by_default(f"that of --actions, or {Settings.robot}")] = None
+    """One of the model's robots."""
+    task: Annotated[Literal["own", "reach", "hover"] | None, by_default(Settings.task)] = None
+    """Task of the scripted expert.
+    own: the robot's own task. reach: bring the tool to the mark. hover: hold the tool above a puck."""
+    frames: Annotated[int | None, by_default(Settings.frames)] = None
+    """Length of an episode, in frames of the model."""
+    hold: Annotated[int | None, by_default(Settings.hold)] = None
+    """Frames in a row at the goal that make a success."""
+    starts: Annotated[int | None, by_default(Settings.starts)] = None
+    """Number of starts in the true simulator, the same for every policy."""
+    actions: Annotated[str | None, arg(metavar="DATASET"), UNSET] = None
+    """Recordings to use instead, as `hma generate` takes them.
+    Policies are then judged by their action error alone."""
+    split: Annotated[str | None, by_default("train")] = None
+    """Split of --actions that policies are trained on."""
+    held_out: Annotated[str | None, arg(name="held-out", metavar="SPLIT"), by_default("val")] = None
+    """Split of --actions that policies are judged on."""
+    registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None
+    """TOML file with your own registry entries, for --actions."""
+
+    def given(self, *names: str) -> dict[str, Any]:
+        """The options among `names` that were given."""
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+
+def make_source(
+    run: Path, training: Training, asked: DemonstrationArguments, simulator: Simulator
+) -> DemonstrationSource:
     """The source of demonstrations that the arguments name. Raises ConfigError for options of the other kind of
     source."""
-    seeds = tuple(range(args.seeds))
-    training = Training(
-        seeds=seeds,
-        steps=args.steps,
-        given=args.given,
-        with_given=args.with_given,
-        through_tokenizer=args.through_tokenizer,
-        temperature=args.temperature,
-    )
-    scripted, recorded = (
-        {name: value for name in names if (value := getattr(args, name)) is not None}
-        for names in (("task", "frames", "hold", "starts"), ("split", "held_out", "registry"))
-    )
-    if args.actions is None:
+    scripted, recorded = asked.given("task", "frames", "hold", "starts"), asked.given("split", "held_out", "registry")
+    if asked.actions is None:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in recorded)
         require(not recorded, f"{options}: only for recordings; give these with --actions DATASET")
-        settings = Settings(**vars(training), robot=args.robot or Settings.robot, **scripted)
+        settings = Settings(**vars(training), robot=asked.robot or Settings.robot, **scripted)
         return ScriptedSource(settings, simulator.robot(settings.robot), simulator.tokenizer.image_size)
     require(not scripted, f"--{', --'.join(scripted)}: only for tasks of the suite, not with recordings (--actions)")
-    use_entries(args.registry, args.run)
-    robot = simulator.robot(args.robot) if args.robot else None
-    place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(args.run).store
-    trained_on, driven = open_trajectories(args.actions, args.split or "train", *place)
-    held_out, _ = open_trajectories(args.actions, args.held_out or "val", *place)
+    use_entries(asked.registry, run)
+    robot = simulator.robot(asked.robot) if asked.robot else None
+    place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(run).store
+    trained_on, driven = open_trajectories(asked.actions, asked.split or "train", *place)
+    held_out, _ = open_trajectories(asked.actions, asked.held_out or "val", *place)
     require_layout(trained_on, driven, simulator.model.table)
     source = RecordedSource(training, driven, trained_on, held_out)
     clipped = survey(trained_on, training.trajectories, driven)
@@ -297,55 +325,57 @@ def load_passive(run: Path, robot: Robot, decode: DecodeConfig) -> Simulator:
     return passive
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, nargs="?", default=FIRST, help="directory of a training run")
-    parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--actions", metavar="DATASET", help="recordings, as `hma generate` takes them")
-    parser.add_argument("--split", help="of DATASET, that policies are trained on (train)")
-    parser.add_argument("--held-out", metavar="SPLIT", help="of DATASET, that they are judged on (val)")
-    parser.add_argument("--registry", type=Path, metavar="FILE", help="TOML file with entries of your own")
-    parser.add_argument("--robot", help=f"of the model; DATASET's, or {Settings.robot}")
-    parser.add_argument("--task", help=f"hover, reach, or own: what its recordings do ({Settings.task})")
-    parser.add_argument("--frames", type=int, help=f"of an episode ({Settings.frames})")
-    parser.add_argument("--hold", type=int, help=f"frames in a row at the goal, for success ({Settings.hold})")
-    parser.add_argument("--starts", type=int, help=f"in the true simulator ({Settings.starts})")
-    parser.add_argument("--seeds", type=int, default=len(Training.seeds), help="how many")
-    parser.add_argument("--steps", type=int, default=Training.steps, help="of training, of every policy")
-    parser.add_argument("--given", type=int, default=Training.given, help="recorded frames that others begin with")
-    parser.add_argument("--with-given", action="store_true", help="train on these, too")
-    parser.add_argument(
-        "--through-tokenizer",
-        action="store_true",
-        help="policies see all frames as the world model's tokenizer reconstructs them, in training and in the true "
-        "simulator: recorded and generated ones then look alike",
+def compare_in_run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")] = FIRST,
+    out: Annotated[Path, arg(metavar="DIR")] = OUT,
+    demonstrations: OmitArgPrefixes[DemonstrationArguments] = DemonstrationArguments(),
+    seeds: int = len(Training.seeds),
+    steps: int = Training.steps,
+    given: int = Training.given,
+    with_given: Annotated[FlagCreatePairsOff[bool], arg(name="with-given"), UNSET] = Training.with_given,
+    through_tokenizer: Annotated[FlagCreatePairsOff[bool], arg(name="through-tokenizer"), UNSET] = False,
+    temperature: float = Training.temperature,
+    without_actions: Annotated[Path | None, arg(name="without-actions", metavar="RUN"), UNSET] = None,
+) -> None:
+    """Trains policies on recorded and generated trajectories, and judges them.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory for everything that is written.
+        seeds: Number of seeds: of which ten trajectories are kept as recorded, and of the policies' training.
+        steps: Training steps of each policy.
+        given: Recorded frames with which each generated trajectory begins.
+        with_given: Train policies on these recorded frames too. Then there is another control: policies that see
+            nothing else of the ninety trajectories.
+        through_tokenizer: Policies see every frame as the tokenizer of RUN reconstructs it, in training and in the true
+            simulator, so that recorded and generated frames look alike.
+        temperature: Temperature at which tokens or latents are sampled; 0: greedy decoding.
+        without_actions: Second control: the run of a model that was trained without actions on the same video.
+    """
+    training = Training(
+        seeds=tuple(range(seeds)),
+        steps=steps,
+        given=given,
+        with_given=with_given,
+        through_tokenizer=through_tokenizer,
+        temperature=temperature,
     )
-    parser.add_argument(
-        "--temperature",
-        type=float,
-        default=Training.temperature,
-        help="at which tokens or latents are sampled; 0: greedy",
+    simulator = load_simulator(
+        run, own_starts=True, episodes=BATCH, decode=change_decode(find_decode(run), temperature), history=1
     )
-    parser.add_argument(
-        "--without-actions", type=Path, metavar="RUN", help="second control: of the same video, trained without actions"
-    )
-    args = parser.parse_args()
-    run, out = args.run, args.out
-    decode = change_decode(find_decode(run), args.temperature)
-    simulator = load_simulator(run, own_starts=True, episodes=BATCH, decode=decode, history=1)
-    source = make_source(args, simulator)  # a mistyped name claims nothing
+    source = make_source(run, training, demonstrations, simulator)  # a mistyped name claims nothing
     second = out / SECOND
     require(
-        bool(args.without_actions) or not second.exists(),
+        bool(without_actions) or not second.exists(),
         f"{second} shows that --out already has policies of a model without actions: give --without-actions again, or "
         "another --out",
     )
-    settings, without = source.settings, args.without_actions
-    passive = without and load_passive(without, source.robot, simulator.decode)
+    settings = source.settings
+    passive = load_passive(without_actions, source.robot, simulator.decode) if without_actions else None
     require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
     pin_settings(out, run, simulator, settings, may_differ=("seeds",))
     if passive:
-        pin_settings(out, without, passive, file=SECOND)
+        pin_settings(out, without_actions, passive, file=SECOND)
     data = make_data(source, simulator, out, passive)
     through = simulator.tokenizer if settings.through_tokenizer else None
     seen = reconstruct_recorded(data, through, settings.given) if through else data
@@ -356,6 +386,10 @@ def main() -> None:
     kinds = [kind for kind in (*KINDS, PASSIVE_KIND) if kind in data]
     draw_strips([data[kind].images[:2, :shortest] for kind in kinds], kinds, out / "frames.png")
     wrote(*written, out / "frames.png")
+
+
+def main() -> None:
+    run_module(compare_in_run, __doc__)
 
 
 if __name__ == "__main__":

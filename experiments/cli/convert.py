@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from data_pipelines.registry import find_spec
-from experiments.cli.command_line import Commands
 from experiments.presets import get_preset
+from experiments.terminal.command_line import Commands
 from experiments.terminal.progress import say, wrote
 from hma_jax.config import DecodeConfig, Dtype, SamplerConfig, Weights
 from hma_jax.config.evaluation import SamplerKind

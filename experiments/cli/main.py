@@ -9,7 +9,6 @@ from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
 from experiments.cli.branch import branch
 from experiments.cli.check import check
-from experiments.cli.command_line import Commands
 from experiments.cli.compare import compare
 from experiments.cli.coord_check import coord_check
 from experiments.cli.data import app as data
@@ -22,6 +21,7 @@ from experiments.cli.play import play
 from experiments.cli.status import status
 from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
+from experiments.terminal.command_line import Commands
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.program import PROGRAM
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
-from experiments.cli.command_line import Commands
 from experiments.preparing.made_from import Step
 from experiments.study_setup import StudySetup, command, make_setup
+from experiments.terminal.command_line import Commands
 from experiments.terminal.progress import console, say, short, step, wrote
 from experiments.terminal.words import counted
 from hma_jax.config import PixelsConfig, require

@@ -8,13 +8,15 @@ Both are drawn in the simulator itself, at the size of the recorded frames.
 
 from __future__ import annotations
 
-import argparse
 import base64
 import io
+import sys
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from PIL import Image, ImageDraw
+from tyro.conf import arg
 
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS, UNSEEN
@@ -22,6 +24,8 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
 from experiments.suite.explained import read_table
+from experiments.terminal.command_line import run_module
+from experiments.terminal.exit_code import exit_code_of
 
 SECONDS = 8.0
 STILLS = 3
@@ -65,10 +69,12 @@ def caption(spec: EmbodimentSpec) -> str:
     return f"{actions}{delay}; {spec.hz} Hz; {spec.episodes} episodes"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True)
-    out = parser.parse_args().out
+def draw(out: Annotated[Path, arg(metavar="DIR")]) -> None:
+    """Draws the page and the sheet.
+
+    Args:
+        out: Directory for both.
+    """
     out.mkdir(parents=True, exist_ok=True)
     shares, page = read_table(), [HEAD]
     families = {
@@ -99,5 +105,9 @@ def main() -> None:
     print(f"wrote {out / 'clips.html'} and {out / 'sheet.jpg'}")
 
 
+def main() -> None:
+    run_module(draw, __doc__)
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code_of(main, resumes=False))

@@ -15,12 +15,14 @@ controllability is judged against this share.
 
 from __future__ import annotations
 
-import argparse
 import csv
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from tyro.conf import arg
 
 from data_pipelines.registry.spec import FRAME_RATE, stride_of
 from data_pipelines.suite.appearance import draw_appearance
@@ -29,6 +31,8 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
+from experiments.terminal.command_line import run_module
+from experiments.terminal.exit_code import exit_code_of
 
 OUT = Path(__file__).parents[1] / "results" / "suite" / "explained.csv"
 STATES = 96
@@ -107,10 +111,14 @@ def read_table(path: Path = OUT) -> dict[str, ExplainedShare]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=OUT)
-    out = parser.parse_args().out
+def measure_robots(
+    out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(default: the committed one)")] = OUT,
+) -> None:
+    """Measures all robots and writes a table.
+
+    Args:
+        out: The table.
+    """
     rows = []
     for spec in EMBODIMENTS:
         rows.append(explained(spec))
@@ -126,5 +134,9 @@ def main() -> None:
     print(f"{enough} of {len(rows)} robots: actions explain at least 30 % of the pixels' change")
 
 
+def main() -> None:
+    run_module(measure_robots, __doc__)
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code_of(main, resumes=False))

@@ -13,13 +13,15 @@ robots of the other family with the same number of action values; each of them i
 
 from __future__ import annotations
 
-import argparse
 import csv
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from tyro.conf import arg
 
 from data_pipelines.registry.spec import FRAME_RATE, stride_of
 from data_pipelines.suite.embodiments import EMBODIMENTS, siblings, strangers
@@ -27,6 +29,8 @@ from data_pipelines.suite.render import positions_of
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
 from experiments.analysis.intervals import interval_of
+from experiments.terminal.command_line import run_module
+from experiments.terminal.exit_code import exit_code_of
 from hma_jax.evaluation.statistics import mean_and_sem
 
 OUT = Path("experiments/results/suite/siblings.csv")
@@ -131,10 +135,12 @@ def gain(control: Sequence[np.ndarray], own: Sequence[np.ndarray]) -> tuple[floa
     return i.mean, i.low, i.high
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=OUT)
-    out = parser.parse_args().out
+def compare_families(out: Annotated[Path, arg(metavar="FILE")] = OUT) -> None:
+    """Judges all families and writes a table.
+
+    Args:
+        out: The table.
+    """
     families = list(dict.fromkeys(s.family for s in EMBODIMENTS))
     samples = {s.name: sample(s, _padded(s)) for s in EMBODIMENTS}
     rows = []
@@ -158,5 +164,9 @@ def _padded(spec: EmbodimentSpec) -> int:
     return max(s.body.size for s in (spec, *siblings(spec), *strangers(spec)))
 
 
+def main() -> None:
+    run_module(compare_families, __doc__)
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code_of(main, resumes=False))

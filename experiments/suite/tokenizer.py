@@ -8,15 +8,19 @@ of those of its pixels that changed noticeably.
 
 from __future__ import annotations
 
-import argparse
 import csv
+import sys
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from tyro.conf import Positional, arg
 
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.images import fit_image
+from experiments.terminal.command_line import run_module
+from experiments.terminal.exit_code import exit_code_of
 from hma_jax.tokenizers.io import load_tokenizer
 
 OUT = Path("experiments/results/suite/tokenizer.csv")
@@ -50,19 +54,24 @@ def quality(decoded: np.ndarray, pairs: np.ndarray) -> tuple[float, float, float
     return float(frames.mean()), float(10 * np.log10(255**2 / error[changed].mean())), float(changed.mean())
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, default=OUT)
-    args = parser.parse_args()
-    tokenizer, rows = load_tokenizer(args.run / "tokenizer"), []
-    for directory in sorted((args.run / "suite").iterdir()):
+def measure_run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    out: Annotated[Path, arg(metavar="FILE")] = OUT,
+) -> None:
+    """Measures the tokenizer of a run and writes a table.
+
+    Args:
+        run: Directory with the tokenizer and the suite's recordings.
+        out: The table.
+    """
+    tokenizer, rows = load_tokenizer(run / "tokenizer"), []
+    for directory in sorted((run / "suite").iterdir()):
         pairs = frame_pairs(get_spec(directory.name), directory, tokenizer.image_size)
         decoded = tokenizer.reconstruct(pairs[:, 1])
         rows.append([directory.name, *quality(decoded, pairs)])
     rows.append(["mean", *np.mean([row[1:] for row in rows], 0)])
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    with args.out.open("w", newline="") as file:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with out.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["robot", "psnr", "psnr_changed", "changed"])
         writer.writerows([name, *(f"{value:.3f}" for value in values)] for name, *values in rows)
@@ -71,5 +80,9 @@ def main() -> None:
     )
 
 
+def main() -> None:
+    run_module(measure_run, __doc__)
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code_of(main, resumes=False))

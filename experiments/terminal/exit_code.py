@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 
 from data_pipelines.errors import DataError, EpisodeError
-from experiments.run_study import TrialsFailed
 from experiments.running.children import plain_messages, silence_background
+from experiments.running.runner import TrialsFailed
 from experiments.terminal.program import open_closed_output
 from experiments.terminal.progress import OUTPUT, errors
 from hma_jax.config import ConfigError

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from experiments.cli import main as program
-from experiments.cli.command_line import Commands, joined, wrapped
+from experiments.terminal.command_line import Commands, joined, wrapped
+from tests.experiments.programs import programs, run_program
 
 PYTHON = re.compile(r"\b(None|True|False|STR|INT|FLOAT|BOOL|PATH(?!=))\b|\(default: \)|Default: ")
 """What is no word of a help: types and values of Python, an empty default, a default told in another way."""
@@ -23,12 +24,16 @@ def names(app: Commands, *before: str) -> Iterator[tuple[str, ...]]:
             yield (*before, name)
 
 
-COMMANDS = list(names(program.app))
+COMMANDS = [*names(program.app), *((name,) for name in programs())]
+"""Those of `hma`, and modules that are programs of their own."""
 
 
 def said_by(capsys, *arguments: str) -> list[str]:
     with pytest.raises(SystemExit) as end:
-        program.main(arguments)
+        if arguments[0].startswith("experiments."):
+            run_program(arguments[0], arguments[1:])
+        else:
+            program.main(arguments)
     out, err = capsys.readouterr()
     assert bool(err) == bool(end.value.code)
     return (out + err).splitlines()
@@ -88,6 +93,18 @@ def test_lines_of_a_docstring_are_joined():
         "Do it.\n\nFirst this, `then` that.\n\nArgs:\n    one: Of several lines. (default: as in (x))\n    two: Short."
     )
     assert joined(joined(doc)) == joined(doc)
+
+
+def test_what_a_module_asks_costs_and_expects_are_paragraphs_of_its_help():
+    doc = """Question: does it
+    work?
+    Command: python -m it
+    Cost: a minute.
+
+    It does: more words.
+    """
+    shown = "Question: does it work?\n\nCommand: python -m it\n\nCost: a minute.\n\nIt does: more words."
+    assert joined(doc) == joined(shown) == shown
 
 
 def test_choices_of_a_usage_are_broken_between_names():

@@ -23,7 +23,7 @@ from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.machine import commit_of
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
 from experiments.running.result_file import read_result, write_result
-from experiments.running.runner import Job, run_missing
+from experiments.running.runner import Job, TrialsFailed, run_missing
 from experiments.running.trial import trial_id
 from experiments.running.trial_checks import check_finished, group_by_sources, require_one_closure
 from experiments.running.workspace import Workspace, find_record, save_record
@@ -136,7 +136,7 @@ def test_a_change_to_the_code_in_mid_sweep_is_refused_by_the_next_trial(checkout
     assert "sources changed since this sweep was started: hma_jax.objective.losses." in states["t0"].message
     assert "If the change alters no result, run the command again with --accept-code" in states["t0"].message
     for accepted, last in ((True, "again: hma study"), (False, "again, .* no result: hma study --accept-code")):
-        with pytest.raises(study_runs.TrialsFailed, match=f"To try them {last}$") as failed:
+        with pytest.raises(TrialsFailed, match=f"To try them {last}$") as failed:
             study_runs.require_results(jobs, states, "hma study", accepted)
     for line in ("missing: trial 1", "missing: trial 2"):
         assert f"  {line}: not started, because another trial was refused\n" in str(failed.value)

@@ -12,10 +12,10 @@ import pytest
 from data_pipelines.registry import get_mixture, get_spec
 from experiments import run_study, study_setup
 from experiments.cli import evaluate, tokenize, tokenizer, train
-from experiments.cli.command_line import Commands
 from experiments.cli.main import main
 from experiments.running.workspace import Record, save_record
 from experiments.study_setup import StudyArguments, StudySetup, make_setup
+from experiments.terminal.command_line import Commands
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.test_cli_errors import idle_training  # noqa: F401

@@ -10,11 +10,12 @@ variant, a sheet of frames with the truth above. A detector is needed (experimen
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
 
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications.detector import COMMITTED, WEIGHTS, Detector, select_robots
@@ -25,9 +26,12 @@ from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row, over_robots, rows_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
+from experiments.running.run_options import UNSET
+from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import console, step, wrote
 from hma_jax.config import ExecutionConfig, require
+from hma_jax.config.base import require_choice
 from hma_jax.simulator.folder import change_decode, find_decode
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
@@ -45,7 +49,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 """Changes of the decoding settings in RUN/decode.json."""
 
-KINDS: tuple[Kind, ...] = ("behaviour", "extremes", "alternation")
 TABLE = "endurance.csv"
 PRINTED = (
     "psnr", "psnr_still", "tool_found", "tool_close", "object_found", "object_close", "follows", "moves",
@@ -79,58 +82,83 @@ def load_variant(run: Path, variant: str, robots: int) -> Simulator:
     return load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=robots, decode=decode, history=1)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
-    parser.add_argument("--minutes", type=float, default=10.0, help="of simulated time")
-    parser.add_argument("--starts", type=int, default=1, help="of each robot")
-    parser.add_argument("--robots", nargs="+", default=[], metavar="ROBOT", help="only these of the run")
-    parser.add_argument("--variants", nargs="+", default=["shipped"], choices=list(VARIANTS), metavar="NAME")
-    parser.add_argument("--drives", nargs="+", default=["behaviour"], choices=KINDS)
-    parser.add_argument("--every", type=float, default=60.0, help="seconds per row of the table")
-    parser.add_argument("--name", default="model", help="of the run, in file names and the table")
-    parser.add_argument("--table", default=TABLE, help="file in DIR; curves of the same name")
-    parser.add_argument("--detector", type=Path, default=COMMITTED / WEIGHTS)
-    args = parser.parse_args()
-    require(args.minutes > 0, f"--minutes must be positive, got {args.minutes:g}")
-    require(args.starts >= 1, f"--starts must be at least 1, got {args.starts}")
+def drive_run(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/endurance"),
+    minutes: float = 10.0,
+    starts: int = 1,
+    robots: Annotated[tuple[str, ...], arg(metavar="NAME ..."), UNSET] = (),
+    variants: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("shipped",),
+    drives: tuple[Kind, ...] = ("behaviour",),
+    every: Annotated[float, arg(metavar="SECONDS")] = 60.0,
+    name: str = "model",
+    table: Annotated[str, arg(metavar="FILE")] = TABLE,
+    detector: Annotated[Path, arg(metavar="FILE")] = COMMITTED / WEIGHTS,
+) -> None:
+    """Drives the robots of a run for minutes, and measures the frames.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory for everything that is written.
+        minutes: Simulated time of a film.
+        starts: Number of starts of each robot, each with a film of its own.
+        robots: Only these robots; without it all robots of the run that the suite can simulate.
+        variants: Changes of the decoding: shipped (none), streaming (keys and values of past frames are kept),
+            likeliest (greedy decoding), temperature_0.4, temperature_1, confidence (the most confident tokens are
+            unmasked first), steps_2, steps_16 (unmasking steps per frame).
+        drives: What the robots are told. behaviour: as in their data, restarted every 12 s. extremes: one action value
+            after the other stays at an end of its range for 2 s. alternation: all values jump from end to end every
+            frame.
+        every: Seconds of simulated time in a row of the table.
+        name: Name of the run, in the table and in names of files.
+        table: Name of the table in --out; the curves have the same name.
+        detector: Detector of tools and objects, as `python -m experiments.applications.detector` writes it.
+    """
+    require(minutes > 0, f"--minutes must be positive, got {minutes:g}")
+    require(starts >= 1, f"--starts must be at least 1, got {starts}")
+    require(bool(variants and drives), "--variants and --drives need at least one name")
+    for variant in variants:
+        require_choice(variant, tuple(VARIANTS), "--variants")
     require(
-        0 < args.every < 120 * args.minutes,
-        f"--every {args.every:g}: a row of the table needs at least half as many seconds, but --minutes "
-        f"{args.minutes:g} are {60 * args.minutes:g}; give a smaller --every",
+        0 < every < 120 * minutes,
+        f"--every {every:g}: a row of the table needs at least half as many seconds, but --minutes "
+        f"{minutes:g} are {60 * minutes:g}; give a smaller --every",
     )
-    detector, simulator, rows = Detector.load(args.detector), load_simulator(args.run), []
-    robots = select_robots(native_robots(simulator.robots), args.robots)
-    starts = true_starts_of(simulator, robots, args.starts)
-    pin_name(args.out, args.name, args.run, simulator, args.detector)
-    for kind in args.drives:
-        for variant in args.variants:
+    finder, simulator, rows = Detector.load(detector), load_simulator(run), []
+    driven = select_robots(native_robots(simulator.robots), robots)
+    begins = true_starts_of(simulator, driven, starts)
+    pin_name(out, name, run, simulator, detector)
+    for kind in drives:
+        for variant in variants:
             new: list[Row] = []
-            for which in range(args.starts):
-                path = film_path(args.out, args.name, variant, kind, args.minutes, which, args.robots)
+            for which in range(starts):
+                path = film_path(out, name, variant, kind, minutes, which, robots)
                 unfinished = path.with_name(f"{path.name}.unfinished")
                 if not path.exists():
-                    with step(f"{variant}, {kind}, {args.minutes:g} min, start {which}") as update:
-                        drives = [
-                            make_drive(robot, starts[name][which], round(60 * args.minutes * robot.hz), kind, which)
-                            for name, robot in robots.items()
+                    with step(f"{variant}, {kind}, {minutes:g} min, start {which}") as update:
+                        told = [
+                            make_drive(robot, begins[key][which], round(60 * minutes * robot.hz), kind, which)
+                            for key, robot in driven.items()
                         ]
-                        filmed = load_variant(args.run, variant, len(robots))
-                        save_films(make_films(filmed, detector, drives, unfinished, update), path)
+                        filmed = load_variant(run, variant, len(driven))
+                        save_films(make_films(filmed, finder, told, unfinished, update), path)
                 unfinished.unlink(missing_ok=True)
                 films = load_films(path)
-                hz = {name: SPECS[name].hz for name in films}
-                tools = {name: len(SPECS[name].body.tools) for name in films}
-                new += rows_of(f"{args.name}/{variant}", kind, which, films, hz, tools, args.every)
+                hz = {key: SPECS[key].hz for key in films}
+                tools = {key: len(SPECS[key].body.tools) for key in films}
+                new += rows_of(f"{name}/{variant}", kind, which, films, hz, tools, every)
             print_rows(new)
             rows += new
-            draw_sheet(films, args.out / f"{'-'.join([args.name, variant, kind, *args.robots])}.png")
+            draw_sheet(films, out / f"{'-'.join([name, variant, kind, *robots])}.png")
             console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
-    table, curves = args.out / args.table, (args.out / args.table).with_suffix(".png")
-    write_rows(table, rows)
-    draw_curves([row for row in rows if row["drive"] == args.drives[0]], curves)
-    wrote(table, curves)
+    curves = (out / table).with_suffix(".png")
+    write_rows(out / table, rows)
+    draw_curves([row for row in rows if row["drive"] == drives[0]], curves)
+    wrote(out / table, curves)
+
+
+def main() -> None:
+    run_module(drive_run, __doc__)
 
 
 def print_rows(rows: list[Row]) -> None:

@@ -6,21 +6,21 @@ Expected: within the model's window, hidden objects come back as often as object
           there. Found: they come back less often; in small models, the longer they were hidden the less often
           (docs/endurance.md).
 
-Events come from held-out episodes in which an object is covered by the robot or leaves the image, and is back within
-`HORIZON` frames after the start. Each has a control: an object that is seen all the time, judged equally long after a
+Events come from held-out episodes in which an object is covered by the robot or leaves the image, and is back soon
+after the start. Each has a control: an object that is seen all the time, judged equally long after a
 start with the same number of frames. Writes DIR/NAME_hidden.csv, a row per event; `moved_px` is how far the object
 truly is from where it was last seen.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from tyro.conf import Positional, arg
 
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.appearance import draw_appearance
@@ -35,6 +35,7 @@ from experiments.applications.endurance.tables import Row
 from experiments.applications.scenes import VISIBLE_SHARE, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
 from experiments.applications.tables import write_rows
+from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import console, step, wrote
 from hma_jax.config import ExecutionConfig, require
@@ -144,20 +145,27 @@ def judge(
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
-    parser.add_argument("--name", default="model", help="of the run, in the table's name")
-    parser.add_argument("--detector", type=Path, default=COMMITTED / WEIGHTS)
-    args = parser.parse_args()
-    detector, rows, table = Detector.load(args.detector), [], args.out / f"{args.name}_hidden.csv"
-    simulator = load_simulator(args.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
+def measure_hidden(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/endurance"),
+    name: str = "model",
+    detector: Annotated[Path, arg(metavar="FILE")] = COMMITTED / WEIGHTS,
+) -> None:
+    """Measures a run.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory for the table.
+        name: Name of the run, with which the table's name begins.
+        detector: Detector of tools and objects, as `python -m experiments.applications.detector` writes it.
+    """
+    finder, rows, table = Detector.load(detector), [], out / f"{name}_hidden.csv"
+    simulator = load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
     robots = native_robots(simulator.robots)
-    pin_name(args.out, args.name, args.run, simulator, args.detector)
+    pin_name(out, name, run, simulator, detector)
     with step("objects that come back") as update:
-        for i, name in enumerate(robots):
-            spec, rng = SPECS[name], np.random.default_rng([0, i])
+        for i, robot in enumerate(robots):
+            spec, rng = SPECS[robot], np.random.default_rng([0, i])
             rollout = simulate(spec, episode_seeds(spec, EPISODES, 0, "val"))
             n, steps = rollout.q.shape[:2]
             flat = (x.reshape(-1, *x.shape[2:]) for x in (rollout.q, rollout.objects))
@@ -166,8 +174,8 @@ def main() -> None:
             if events:
                 # unused episodes repeat the first event
                 judged = (events * (2 * PER_ROBOT))[: 2 * PER_ROBOT]
-                rows += judge(simulator, detector, spec, rollout, judged)[: len(events)]
-            update(i + 1, len(robots), name)
+                rows += judge(simulator, finder, spec, rollout, judged)[: len(events)]
+            update(i + 1, len(robots), robot)
     require(bool(rows), f"no object is hidden and comes back in held-out episodes of {', '.join(robots)}")
     write_rows(table, rows)
     for kind in ("hidden", "control"):
@@ -176,6 +184,10 @@ def main() -> None:
         means = {k: np.mean([float(r[k]) for r in own]) for k in names}
         console.print(f"{kind}: {len(own)} events, " + ", ".join(f"{k} {v:.2f}" for k, v in means.items()))
     wrote(table)
+
+
+def main() -> None:
+    run_module(measure_hidden, __doc__)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from experiments.cli.bench import models, others
-from experiments.cli.command_line import Commands
+from experiments.terminal.command_line import Commands
 
 HELP = (
     "Measure speed on this machine. Most commands time the fast implementation and the naive one alternately in one "

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from experiments.cli.arguments import ReplaceOptions, StudyOptions
-from experiments.cli.command_line import Commands
 from experiments.cli.data import convert, registry, sim
 from experiments.cli.data.export import data_export
 from experiments.cli.data.view import view
 from experiments.study_setup import make_setup
+from experiments.terminal.command_line import Commands
 from experiments.terminal.progress import wrote
 
 HELP = "List, inspect, view, convert, export and simulate datasets."

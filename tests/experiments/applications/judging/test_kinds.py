@@ -17,8 +17,8 @@ from experiments.applications.judging.summary import MODEL
 from experiments.applications.judging.user_policies import TAKEN
 from experiments.applications.policies.kinds import KINDS
 from experiments.cli import judge as command
-from experiments.cli.command_line import joined
 from experiments.cli.main import main
+from experiments.terminal.command_line import joined
 
 
 def none_but(kind: str, count: int) -> LadderConfig:

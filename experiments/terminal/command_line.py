@@ -33,6 +33,9 @@ BORDER = "│╭╰"
 
 BREAK = "\x00"
 
+HEADING = re.compile(r"(Question|Paper|Command|Cost|Expected): ")
+"""What begins a paragraph in the help of a module, though its docstring only begins a line with it."""
+
 REPEATED = ("--set", "--launcher-set")
 """Options that take one 'path=value' each time."""
 
@@ -46,14 +49,8 @@ class Commands(SubcommandApp):
     def run(self, prog: str, arguments: Sequence[str], description: str | None = None) -> None:
         """Runs the command that the arguments name. Exits with a message if they are wrong, and after printing a help
         text."""
-        shown = _wrapped() if {"-h", "--help"} & set(arguments) else nullcontext()
-        with _values(), shown:
-            try:
-                self._run(prog, list(arguments), description)
-            except SystemExit as end:
-                if end.code and (advice := repeat_option(arguments)):
-                    print(f"error: {advice}", file=sys.stderr)
-                raise
+        with _reading(arguments):
+            self._run(prog, list(arguments), description)
 
     def _run(self, prog: str, arguments: list[str], description: str | None) -> None:
         found = self._subcommands.get(arguments[0]) if arguments else None
@@ -65,8 +62,7 @@ class Commands(SubcommandApp):
         if isinstance(found.target, Commands):
             found.target._run(prog, arguments, found.help)
         else:
-            _join_lines(found.target)
-            tyro.cli(found.target, prog=prog, description=found.help, args=arguments)
+            _run_command(found.target, prog, arguments, found.help)
 
     def _join_lines(self) -> None:
         for found in self._subcommands.values():
@@ -74,6 +70,17 @@ class Commands(SubcommandApp):
                 found.target._join_lines()
             else:
                 _join_lines(found.target)
+
+
+def run_module(command: Callable[..., None], description: str, arguments: Sequence[str] | None = None) -> None:
+    """The main of a module that is a program of its own: runs `command` with the arguments, by default those of the
+    process. `description`: the module's docstring, which its help shows. Exits as `Commands.run`."""
+    name = command.__module__
+    if name == "__main__" and (spec := sys.modules[name].__spec__) is not None:
+        name = spec.name
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with _reading(arguments):
+        _run_command(command, f"python -m {name.removesuffix('.__main__')}", list(arguments), joined(description))
 
 
 def repeat_option(arguments: Sequence[str]) -> str:
@@ -101,6 +108,8 @@ def joined(doc: str) -> str:
     for line in inspect.cleandoc(doc).splitlines():
         depth = len(line) - len(line.lstrip())
         goes_on = depth > 4 if arguments else True
+        if lines and lines[-1] and HEADING.match(line):
+            lines.append("")
         if lines and lines[-1] and line and goes_on and lines[-1] != "Args:":
             lines[-1] += f" {line.strip()}"
         else:
@@ -111,6 +120,23 @@ def joined(doc: str) -> str:
 
 def _join_lines(function: Callable[..., Any]) -> None:
     function.__doc__ = joined(function.__doc__ or "")  # where tyro reads the help
+
+
+def _run_command(command: Callable[..., Any], prog: str, arguments: list[str], description: str | None) -> None:
+    _join_lines(command)
+    tyro.cli(command, prog=prog, description=description, args=arguments)
+
+
+@contextmanager
+def _reading(arguments: Sequence[str]) -> Iterator[None]:
+    """What holds while tyro reads arguments and prints help texts."""
+    with _values(), _wrapped() if {"-h", "--help"} & set(arguments) else nullcontext():
+        try:
+            yield
+        except SystemExit as end:
+            if end.code and (advice := repeat_option(arguments)):
+                print(f"error: {advice}", file=sys.stderr)
+            raise
 
 
 def wrapped(text: str, width: int) -> str:
