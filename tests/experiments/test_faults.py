@@ -31,7 +31,7 @@ from hma_jax.training.reading import find_damage, list_steps
 from hma_jax.training.run_lock import EVALUATION, locked_run
 from hma_jax.training.runs import load_model, load_run
 from tests.data_pipelines.fakes import write_rlds
-from tests.experiments.test_cli_errors import ARM, LENGTHS, SMOKE, idle_training  # noqa: F401
+from tests.experiments.idle import ARM, LENGTHS, SMOKE, idle_training  # noqa: F401
 from tests.full_disk import full_disk
 
 ROOT = Path(__file__).parents[2]

@@ -24,7 +24,7 @@ from experiments.study_setup import find_directories
 from hma_jax.simulator.robots import Robot
 from hma_jax.training.runs import load_run
 from tests.data_pipelines.convert import sources
-from tests.experiments.test_cli_errors import SMOKE, idle_training  # noqa: F401
+from tests.experiments.idle import SMOKE, idle_training  # noqa: F401
 
 pytest.importorskip("av")
 

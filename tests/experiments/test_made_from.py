@@ -33,7 +33,7 @@ from experiments.study_setup import StudyArguments, make_setup
 from hma_jax.evaluation.statistics import Stat
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments import fakes
-from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
+from tests.experiments.idle import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
 STEPS = ("suite", "tokenizer", "tokens", "windows", "study")
 

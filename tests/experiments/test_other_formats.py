@@ -8,7 +8,7 @@ import pytest
 
 from experiments.cli.main import main
 from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
-from tests.experiments.test_cli_errors import idle_training  # noqa: F401
+from tests.experiments.idle import idle_training  # noqa: F401
 
 pytest.importorskip("av")
 

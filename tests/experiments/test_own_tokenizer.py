@@ -12,7 +12,7 @@ from experiments.running.run_trial import open_prepared_data
 from experiments.running.workspace import Workspace
 from hma_jax.tokenizers.io import load_tokenizer
 from tests.data_pipelines.fakes import write_rlds
-from tests.experiments.test_cli_errors import SMOKE
+from tests.experiments.idle import SMOKE
 from tests.hma_jax.test_own_tokenizer import COLOURS, write
 
 ARM = get_spec("berkeley_gnm_cory_hall")

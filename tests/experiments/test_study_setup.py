@@ -18,7 +18,7 @@ from experiments.study_setup import StudyArguments, StudySetup, make_setup
 from experiments.terminal.command_line import Commands
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.experiments.fakes import PROVENANCE
-from tests.experiments.test_cli_errors import idle_training  # noqa: F401
+from tests.experiments.idle import idle_training  # noqa: F401
 
 ARM = get_spec("berkeley_gnm_cory_hall")
 ENTRIES = """["my_robot"]

@@ -34,7 +34,7 @@ from tests.data_pipelines.fakes import FakeTokenizer, write_rlds
 from tests.data_pipelines.tokenizing import tokenize_dataset
 from tests.data_pipelines.tokens.job_process import contents
 from tests.experiments.fakes import STUDY
-from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
+from tests.experiments.idle import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ from hma_jax.training.run_lock import locked_run
 from hma_jax.training.runs import load_run
 from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.windows.test_evalset import small_store
-from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
+from tests.experiments.idle import ARM, BASE, SMOKE, idle_training  # noqa: F401
 from tests.hma_jax.convert.fakes import DISCRETE, make_checkpoint
 
 
