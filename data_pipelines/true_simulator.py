@@ -14,7 +14,15 @@ import numpy as np
 from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.config import require
 from hma_jax.config.base import require_choice
-from hma_jax.simulator.interface import HISTORY, Actions, chosen_episodes, each_start, read_only, whole_numbers
+from hma_jax.simulator.interface import (
+    HISTORY,
+    Actions,
+    WholeNumbers,
+    chosen_episodes,
+    each_start,
+    read_only,
+    whole_numbers,
+)
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
 
@@ -92,8 +100,8 @@ class TrueSimulator(ABC, Generic[W]):
         self,
         starts: Start | Sequence[Start],
         *,
-        seeds: int | Sequence[int] | np.ndarray = 0,
-        episodes: Sequence[int] | None = None,
+        seeds: int | WholeNumbers = 0,
+        episodes: WholeNumbers | None = None,
     ) -> np.ndarray:
         """Begins at the last frames of `starts`, which must have the seeds of their episodes; `seeds` have no
         effect."""
@@ -136,7 +144,7 @@ class TrueSimulator(ABC, Generic[W]):
         self._draw(asked)
         return self.images
 
-    def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
+    def rewind(self, frames: int, episodes: WholeNumbers | None = None) -> np.ndarray:
         [frames] = whole_numbers("frames", [frames])
         which = chosen_episodes(episodes, len(self))
         worlds = {b: self._begun(b)[0] for b in which}

@@ -17,6 +17,9 @@ from hma_jax.simulator.starts import Start
 Actions = Sequence[ArrayLike | None] | np.ndarray | jax.Array
 """One entry per episode: an array of numbers, or None for an episode that waits."""
 
+WholeNumbers = Sequence[int] | np.ndarray
+"""Numbers or seeds of episodes."""
+
 
 class AnySimulator(Protocol):
     """B episodes that begin at recorded starts and advance frame by frame; `Simulator` documents the methods."""
@@ -38,13 +41,13 @@ class AnySimulator(Protocol):
         self,
         starts: Start | Sequence[Start],
         *,
-        seeds: int | Sequence[int] | np.ndarray = 0,
-        episodes: Sequence[int] | None = None,
+        seeds: int | WholeNumbers = 0,
+        episodes: WholeNumbers | None = None,
     ) -> np.ndarray: ...
 
     def step(self, actions: Actions) -> np.ndarray: ...
 
-    def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray: ...
+    def rewind(self, frames: int, episodes: WholeNumbers | None = None) -> np.ndarray: ...
 
 
 HISTORY = 600
@@ -58,7 +61,7 @@ def read_only(images: np.ndarray) -> np.ndarray:
     return view
 
 
-def whole_numbers(what: str, values: Sequence[int] | np.ndarray) -> list[int]:
+def whole_numbers(what: str, values: WholeNumbers) -> list[int]:
     """`values` as ints. Raises ConfigError for anything but integers: 0.5 is not truncated to 0, and a mask is not a
     list of numbers."""
     try:
@@ -70,7 +73,7 @@ def whole_numbers(what: str, values: Sequence[int] | np.ndarray) -> list[int]:
     raise ConfigError(f"{what} must be whole numbers, got {values!r}")
 
 
-def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:
+def chosen_episodes(episodes: WholeNumbers | None, count: int) -> list[int]:
     """The episodes, of `count`, that a call is about; None: all. Raises ConfigError for numbers that repeat or do not
     exist."""
     which = list(range(count)) if episodes is None else whole_numbers("episodes", episodes)

@@ -22,7 +22,15 @@ from hma_jax.config.base import require_choice, require_seed
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, find_robots, find_starts, find_tokenizer
-from hma_jax.simulator.interface import HISTORY, Actions, chosen_episodes, each_start, read_only, whole_numbers
+from hma_jax.simulator.interface import (
+    HISTORY,
+    Actions,
+    WholeNumbers,
+    chosen_episodes,
+    each_start,
+    read_only,
+    whole_numbers,
+)
 from hma_jax.simulator.programs import Programs, ResetInputs, padded
 from hma_jax.simulator.robots import Outside, Robot, require_robot
 from hma_jax.simulator.starts import Start
@@ -169,8 +177,8 @@ class Simulator:
         self,
         starts: Start | Sequence[Start],
         *,
-        seeds: int | Sequence[int] | np.ndarray = 0,
-        episodes: Sequence[int] | None = None,
+        seeds: int | WholeNumbers = 0,
+        episodes: WholeNumbers | None = None,
     ) -> np.ndarray:
         """Begins `episodes` (default: all) at `starts`, one for each or one for all. Returns the frames of all
         episodes.
@@ -352,7 +360,7 @@ class Simulator:
         self._episodes = list(copy.deepcopy(snapshot.episodes))
         return self.images
 
-    def branch(self, sources: Sequence[int] | np.ndarray) -> np.ndarray:
+    def branch(self, sources: WholeNumbers) -> np.ndarray:
         """Episode b becomes a copy of episode sources[b], seed included, so that later differences are due only to
         actions."""
         copied = whole_numbers("sources", sources)
@@ -363,7 +371,7 @@ class Simulator:
         self._episodes = [copy.deepcopy(self._episodes[s]) for s in copied]
         return self.images
 
-    def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
+    def rewind(self, frames: int, episodes: WholeNumbers | None = None) -> np.ndarray:
         """Takes `episodes` (default: all) back by `frames` frames.
 
         Later frames are forgotten, and come again under the same actions: exactly with `decode.slide` "exact". With

@@ -3,7 +3,7 @@ look alike."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from experiments.applications.generating.conditions import GENERATED_KINDS
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.policy import Policy
+from hma_jax.simulator.interface import WholeNumbers
 from hma_jax.tokenizers.base import Tokenizer
 
 
@@ -34,7 +35,7 @@ class ThroughTokenizer:
     policy: Policy
     tokenizer: Tokenizer
 
-    def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
+    def reset(self, episodes: WholeNumbers | None = None, *, seeds: WholeNumbers | None = None) -> None:
         self.policy.reset(episodes, seeds=seeds)
 
     def act(self, images: np.ndarray) -> np.ndarray:

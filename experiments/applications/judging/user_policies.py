@@ -7,7 +7,6 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from experiments.applications.policies.kinds import KINDS
 from experiments.applications.policies.policy import Policy
 from experiments.user_input.user_file import function_of, naming_line, run_file
 from hma_jax.config import ConfigError, require
+from hma_jax.simulator.interface import WholeNumbers
 from hma_jax.simulator.robots import Robot
 
 SIGNATURE = "policies(robot)"
@@ -49,7 +49,7 @@ class CheckedPolicy:
         self.policy, self.robot, self.where = policy, robot, where
         self._shape: tuple[int, ...] | None = None  # of what it returned for an image
 
-    def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
+    def reset(self, episodes: WholeNumbers | None = None, *, seeds: WholeNumbers | None = None) -> None:
         self.policy.reset(episodes=episodes, seeds=seeds)
 
     def act(self, images: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.network import Params, as_floats, downsample_uint8
 from experiments.applications.policies.policy import Counts
 from hma_jax.config import require
+from hma_jax.simulator.interface import WholeNumbers
 
 STILL = 1e-4
 """A dimension with a smaller standard deviation in the demonstrations counts as constant."""
@@ -92,13 +93,13 @@ class ChunkPolicy:
         self._fresh: np.ndarray | None = None  # bool [B]: the next image is the first
         self._left: list[list[np.ndarray]] = []  # planned but not executed
 
-    def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
-        self._counts.reset(episodes, seeds)
+    def reset(self, episodes: WholeNumbers | None = None, *, seeds: WholeNumbers | None = None) -> None:
+        which = self._counts.reset(episodes, seeds)
         if episodes is None or self._seen is None:
             self._seen = None
             return
-        self._fresh[list(episodes)] = True
-        for b in episodes:
+        self._fresh[which] = True
+        for b in which:
             self._left[b] = []
 
     def act(self, images: np.ndarray) -> np.ndarray:
@@ -108,7 +109,7 @@ class ChunkPolicy:
         self._seen = np.concatenate([self._seen[:, 1:], images[:, None]], 1)
         self._seen[self._fresh] = images[self._fresh, None]
         self._fresh[:] = False
-        counted = [self._counts.next(b) for b in range(len(images))]
+        counted = self._counts.next(len(images))
         if not all(self._left):  # one call for all: programs are compiled for one size
             planned = self.plan(self._seen, [s for s, _ in counted], [n for _, n in counted])
             planned = self.scale.raw(planned.reshape(len(images), self.config.chunk, -1))

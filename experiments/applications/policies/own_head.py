@@ -6,8 +6,6 @@ the models of this repository were not (`experiments.applications.own_policy` tr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import jax
 import numpy as np
 
@@ -16,6 +14,7 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.protocol import predicts_actions
 from hma_jax.generation import predict_next_actions
 from hma_jax.kernels.random import key_of
+from hma_jax.simulator.interface import WholeNumbers
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.training.runs import Model
@@ -46,13 +45,13 @@ class OwnHeadPolicy:
 
         self._predict = jax.jit(predict)
 
-    def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
-        self._counts.reset(episodes, seeds)
-        if episodes is None:
+    def reset(self, episodes: WholeNumbers | None = None, *, seeds: WholeNumbers | None = None) -> None:
+        which = self._counts.reset(episodes, seeds)
+        if episodes is None or not self._tokens:
             self._tokens, self._chunks = [], []
-        for b in episodes or ():
-            if b < len(self._tokens):
-                self._tokens[b], self._chunks[b] = [], []
+            return
+        for b in which:
+            self._tokens[b], self._chunks[b] = [], []
 
     def act(self, images: np.ndarray) -> np.ndarray:
         count = len(images)
@@ -69,8 +68,8 @@ class OwnHeadPolicy:
             frames[b, : len(seen)] = seen
             if done:
                 actions_BTU[b, : len(done)] = done
-        drawn = [self._counts.next(b) for b in range(count)]
-        seeds = np.array([np.random.default_rng([*pair, 16]).integers(2**32) for pair in drawn], np.uint32)
+        drawn = [np.random.default_rng([*pair, 16]).integers(2**32) for pair in self._counts.next(count)]
+        seeds = np.array(drawn, np.uint32)
         which = np.full(count, self._embodiment, np.int32)
         out = np.asarray(self._predict(self._params, frames, actions_BTU, which, seeds))
         newest = out[np.arange(count), [len(seen) - 1 for seen in self._tokens]]

@@ -29,7 +29,7 @@ def test_it_acts_longer_than_its_window_and_then_sees_only_the_last_frames():
     other._chunks = [list(chunks[:-1]) for chunks in policy._chunks]
     np.testing.assert_allclose(other.act(frames[6]), acted[6], rtol=1e-5)
 
-    policy.reset([0])
+    policy.reset(np.flatnonzero([True, False]))  # an array of 0, whose truth value is false
     again = policy.act(np.stack([frames[0, 0], frames[0, 1]]))
     np.testing.assert_allclose(again[0], acted[0, 0], rtol=1e-5)
     assert not np.array_equal(again[1], acted[0, 1])

@@ -214,12 +214,18 @@ def test_trained_policies_of_every_kind_do_the_same_when_saved_and_damaged_ones_
         load_policy(tmp_path / "one")
 
 
-def test_an_episode_that_begins_anew_forgets_its_past_and_the_others_keep_theirs(demos):
+@pytest.mark.parametrize("which", [[0], np.flatnonzero([True, False])], ids=["a list", "an array"])
+def test_an_episode_that_begins_anew_forgets_its_past_and_the_others_keep_theirs(demos, which):
     config = BcConfig(encoder=SMALL, chunk=3, execute=3)
     policy = ClonedPolicy(config, init_bc(config, 4, 0), scale_of(demos))
     policy.reset()
     policy.act(demos.images[:2, 0])
-    policy.reset([0])
+    for unusable in ([-1], [2], [True, False]):
+        with pytest.raises(ConfigError, match="episodes must be "):
+            policy.reset(unusable)
+    with pytest.raises(ConfigError, match="1 episodes need as many seeds, got 2"):
+        policy.reset([0], seeds=[5, 6])
+    policy.reset(which)
     policy.act(demos.images[:2, 3])
     np.testing.assert_array_equal(policy._seen[0], demos.images[[0, 0], 3])
     np.testing.assert_array_equal(policy._seen[1], demos.images[1, [0, 3]])
@@ -251,8 +257,11 @@ def test_random_actions_depend_on_the_seed_of_an_episode_alone():
     policy, images = RandomPolicy(ROBOT, hold=2), np.zeros((2, 8, 8, 3), np.uint8)
     policy.reset(seeds=[1, 2])
     first = [policy.act(images) for _ in range(3)]
-    policy.reset(seeds=[2, 1])
-    np.testing.assert_array_equal(policy.act(images), first[0][::-1])
+    for seeds in ([2, 1], np.array([2, 1])):
+        policy.reset(seeds=seeds)
+        np.testing.assert_array_equal(policy.act(images), first[0][::-1])
+    policy.reset(np.array([0, 1]), seeds=np.array([1, 2]))
+    np.testing.assert_array_equal(policy.act(images), first[0])
     np.testing.assert_array_equal(first[0], first[1])
     assert not np.array_equal(first[1], first[2])
 
