@@ -23,7 +23,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from hma_jax.config import require
-from hma_jax.simulator.interface import Actions, AnySimulator, Judge, no_judge
+from hma_jax.simulator.interface import Actions, AnySimulator, Judge, no_judge, require_frame_steps
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -73,11 +73,7 @@ class _Task:
         _refuse_forked(simulator)
         if simulator is None:
             simulator = Simulator.load(run, episodes=episodes, **options)
-        require(
-            getattr(simulator, "rate", "model") == "model",
-            "an environment needs a simulator of rate='model': its steps, which `max_episode_steps` counts, are "
-            "frames of the model, not native actions",
-        )
+        require_frame_steps(simulator, "an environment")
         require(len(simulator) == episodes, f"the simulator must have {episodes} episodes, but has {len(simulator)}")
         if starts is None:
             starts = getattr(simulator, "starts", ())

@@ -84,6 +84,14 @@ def chosen_episodes(episodes: WholeNumbers | None, count: int) -> list[int]:
     return which
 
 
+def require_frame_steps(simulator: AnySimulator, what: str) -> None:
+    """Raises ConfigError, which begins with `what`, for a simulator whose steps are native actions."""
+    require(
+        getattr(simulator, "rate", "model") == "model",
+        f"{what} needs a simulator of rate='model', whose steps are frames of the model, not native actions",
+    )
+
+
 def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
     """A start for each of `count` episodes, where one may be given for all. Raises ConfigError for anything but
     Starts."""

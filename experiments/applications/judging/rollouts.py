@@ -18,7 +18,7 @@ from experiments.applications.policies.tasks import AnyTask, Task, join, world_o
 from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
-from hma_jax.simulator.interface import AnySimulator
+from hma_jax.simulator.interface import AnySimulator, require_frame_steps
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
@@ -70,8 +70,9 @@ def run(
     """Runs every start once, as many at a time as the simulator has episodes.
 
     `shuffled`: what the policy does in one episode is executed in the next one of the same batch, a control that
-    should succeed no more often than chance.
+    should succeed no more often than chance. Raises ConfigError for a simulator of native actions.
     """
+    require_frame_steps(simulator, "a rollout")
     parts, batch = [], len(simulator)
     require(len(starts) % batch == 0, f"the number of starts, {len(starts)}, is not a multiple of the batch, {batch}")
     for first in range(0, len(starts), batch):

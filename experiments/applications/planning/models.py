@@ -15,6 +15,7 @@ from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
 from experiments.applications.simulators import START_FRAMES
 from hma_jax.config import require
+from hma_jax.simulator.interface import require_frame_steps
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -45,6 +46,8 @@ class LearnedModel:
     """
 
     def __init__(self, simulator: Simulator, robot: Robot, seed: int = 0):
+        """Raises ConfigError for a simulator of native actions."""
+        require_frame_steps(simulator, "planning")
         self._simulator, self._robot, self._seed = simulator, robot, seed
         self._greedy = not simulator.tokenizer.channels and simulator.decode.temperature == 0
         self._present = None

@@ -236,6 +236,12 @@ def test_the_learned_model_imagines_again_from_the_same_present():
     assert (goal_image_cost(imagined[0, -1])(imagined) < goal_image_cost(255 - imagined[0, -1])(imagined)).all()
 
 
+def test_native_actions_are_no_frames_of_a_plan():
+    """A candidate's actions became native ones: of a stride of 3, every third was a frame."""
+    with pytest.raises(ConfigError, match="planning needs a simulator of rate='model', .* not native actions"):
+        LearnedModel(simulator(episodes=2, rate="native"), ROBOTS[0])
+
+
 class Recorder:
     """A simulator of two episodes that keeps what it was reset to, and shows black images."""
 

@@ -148,6 +148,13 @@ def test_whole_chunks_of_a_policy_are_executed_action_by_action():
     assert held.actions.shape == (2, 4, 4) and (held.images != made.images).any()
 
 
+def test_native_actions_are_no_frames_of_a_rollout():
+    simulator = SuiteSimulator([ROBOT], episodes=2, image_size=8)
+    simulator.rate = "native"  # which learned ones may have
+    with pytest.raises(ConfigError, match="a rollout needs a simulator of rate='model', .* not native actions"):
+        run(simulator, RandomPolicy(ROBOT), [], [], TASK)
+
+
 @pytest.mark.parametrize("name", ["own", "reach"])
 def test_the_distance_from_a_goal_is_that_of_the_farthest_tool(name):
     robot = next(r for r, spec in SPECS.items() if len(spec.body.tools) == 2 and isinstance(spec.task, Reach))
