@@ -79,6 +79,7 @@ class LearnedModel:
             log.warning("%s: observed %s; are these its raw units? (this is said once)", self._robot.name, said)
 
     def imagine(self, actions: np.ndarray) -> np.ndarray:
+        require(self._present is not None, "nothing was observed yet: call observe before imagine, or before a plan")
         self._simulator.restore(self._present)
         return np.stack([self._simulator.step(list(actions[:, t])) for t in range(actions.shape[1])], axis=1)
 

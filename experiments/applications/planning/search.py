@@ -45,8 +45,11 @@ class SearchConfig:
 
 
 def finite_costs(score: Score, candidates: np.ndarray) -> np.ndarray:
-    """`score(candidates)`. Raises ConfigError for costs that are not finite."""
-    costs = score(candidates)
+    """`score(candidates)`. Raises ConfigError unless it is one finite number for each candidate."""
+    costs, count = np.asarray(score(candidates)), len(candidates)
+    require(
+        costs.shape == (count,), f"a cost must be one number for each candidate, [{count}], got {list(costs.shape)}"
+    )
     require(bool(np.isfinite(costs).all()), "the cost of a candidate is not finite")
     return costs
 

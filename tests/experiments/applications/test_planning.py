@@ -115,6 +115,23 @@ def test_starts_that_are_skipped_are_those_of_an_earlier_run():
 
 
 @pytest.mark.parametrize("by", SEARCHES)
+@pytest.mark.parametrize("shape", [(), (15,), (16, 1), (16, 6)])
+def test_a_cost_that_is_not_one_number_for_each_candidate_is_no_plan(by, shape):
+    """Where a cost lacked its axis, every plan was to rest."""
+    with pytest.raises(ConfigError, match=re.escape(f"one number for each candidate, [16], got {list(shape)}")):
+        by(lambda c: np.ones(shape), CONFIG, np.zeros((3, 2)), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("by", SEARCHES)
+def test_costs_may_be_a_list(by):
+    plans = [
+        by(lambda c, kind=kind: kind(c.sum((1, 2))), CONFIG, np.zeros((3, 2)), np.random.default_rng(0))
+        for kind in (np.asarray, list)
+    ]
+    np.testing.assert_array_equal(*plans)
+
+
+@pytest.mark.parametrize("by", SEARCHES)
 def test_a_cost_that_is_not_finite_is_no_plan(by):
     with pytest.raises(ConfigError, match="not finite"):
         by(lambda c: np.full(len(c), np.nan), CONFIG, np.zeros((3, 2)), np.random.default_rng(0))
@@ -224,6 +241,8 @@ def test_a_planner_in_the_true_simulator_goes_where_the_picture_says():
 def test_the_learned_model_imagines_again_from_the_same_present():
     robot, rng = ROBOTS[0], np.random.default_rng(0)
     model = LearnedModel(simulator(episodes=2, history=1), robot)
+    with pytest.raises(ConfigError, match="nothing was observed yet: call observe before imagine"):
+        model.imagine(np.zeros((2, 1, robot.action_dim)))
     images = list(rng.integers(0, 256, (5, 8, 8, 3), np.uint8))
     given = list(rng.uniform(robot.low, robot.high, (4, robot.action_dim)).astype(np.float32))
     first, other = rng.uniform(robot.low, robot.high, (2, 2, 3, robot.action_dim)).astype(np.float32)
@@ -257,7 +276,7 @@ class Recorder:
         self.asked.append(seeds)
 
     def snapshot(self):
-        return None
+        return "its state"
 
     def restore(self, snapshot):
         pass
