@@ -14,6 +14,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -32,6 +33,7 @@ PAGES = [
     *sorted((ROOT / "experiments" / "results").glob("*/findings.md")),
 ]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"(?:(?<=\n\n)|\A)((?: {4}.*\n)+)")
 INLINE = re.compile(r"(?<!`)`((?:hma|make|python -m)\b[^`]*)`(?!`)")
 STARTS = ("hma", "make", "pip", "python")
 TOP = ("hma_jax/", "data_pipelines/", "experiments/", "tests/", "docs/", ".ci/")
@@ -46,8 +48,10 @@ QUICK = (
 
 
 def blocks(page: str) -> Iterator[str]:
-    """Commands of the blocks of a page, one by one: comments, prompts and what a shell does around them left out."""
-    for language, text in BLOCK.findall(page):
+    """Commands of the blocks of a page, fenced or indented, one by one: comments, prompts and what a shell does around
+    them left out."""
+    indented = [("", textwrap.dedent(text)) for text in INDENTED.findall(BLOCK.sub("", page))]
+    for language, text in BLOCK.findall(page) + indented:
         if language not in ("", "sh"):
             continue
         known: dict[str, str] = {}

@@ -26,13 +26,14 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import numpy as np
 from PIL import Image
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from data_pipelines.publishing.files import publish
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
 from experiments.applications.simulators import held_out, in_suite, load_simulator, save_beside, true_simulator
 from experiments.bench.simulate import time_simulator
 from experiments.running.machine import describe_machine
+from experiments.running.run_options import UNSET
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from hma_jax.config import DecodeConfig, require
@@ -70,18 +71,26 @@ class Shipped(NamedTuple):
 
 
 def ship(
-    source: Path, out: Path, decode: DecodeConfig | None = None, add: Callable[[Path], None] = lambda made: None
+    source: Path,
+    out: Path,
+    decode: DecodeConfig | None = None,
+    add: Callable[[Path], None] = lambda made: None,
+    *,
+    replace: bool = False,
 ) -> None:
-    """Replaces `out`, completely or not at all, by the model and by what `add` writes beside it.
+    """Writes the model to `out`, completely or not at all, with what `add` writes beside it. `replace`: in place of an
+    earlier shipped model.
 
-    Raises ConfigError if `out` is anything other than an earlier shipped model, for a robot outside the suite, and if
-    the model would be too large.
+    Raises ConfigError if `out` holds anything that may not be replaced, for a robot outside the suite, and if the model
+    would be too large.
     """
-    shipped = not out.exists() or (out / REPORT).is_file() or not any(out.iterdir())
-    require(
-        shipped,
-        f"--out {out} has no {REPORT}, so it is not a shipped model, and it would be overwritten; choose another --out",
-    )
+    if out.exists() and any(out.iterdir()):
+        require(
+            (out / REPORT).is_file(),
+            f"--out {out} has no {REPORT}, so it is not a shipped model, and it would be overwritten; choose another "
+            "--out",
+        )
+        require(replace, f"--out {out} holds a shipped model; choose another --out, or add --replace to replace it")
     run = load_run(source, "auto")
     simulator = load_simulator(source)
     foreign = [name for name, robot in simulator.robots.items() if not in_suite(robot)]
@@ -206,16 +215,19 @@ def ship_run(
     out: Annotated[Path, arg(metavar="DIR")],
     unmask_steps: Annotated[int, arg(name="unmask-steps", metavar="M")] = DEFAULT_DECODE.unmask_steps,
     temperature: float = DEFAULT_DECODE.temperature,
+    replace: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
 ) -> None:
     """Makes a run small enough for the repository, and describes it.
 
     Args:
         run: Directory of a training run.
-        out: Directory for the model. If it holds one, that is replaced.
+        out: Directory for the model.
         unmask_steps: Unmasking steps per frame; more are slower.
         temperature: Temperature at which tokens or latents are sampled; 0: greedy decoding.
+        replace: Replace the shipped model that --out holds.
     """
-    ship(run, out, change_decode(DEFAULT_DECODE, temperature, unmask_steps=unmask_steps), describe)
+    decode = change_decode(DEFAULT_DECODE, temperature, unmask_steps=unmask_steps)
+    ship(run, out, decode, describe, replace=replace)
 
 
 def main() -> None:

@@ -58,8 +58,9 @@ def generate(
         seed: Random seed; another one gives other samples of the same episodes.
         batch: Episodes generated at the same time. It affects the frames, through rounding.
         clips: Number of episodes that are also written as MP4, the recording on the left. With 0, PyAV is not needed.
-        unmask_steps: Unmasking steps per frame. Default: as in RUN/decode.json.
-        temperature: Temperature at which tokens or latents are sampled. Default: as in RUN/decode.json.
+        unmask_steps: Unmasking steps per frame; more are slower. Default: as in RUN/decode.json, or 2.
+        temperature: Temperature at which tokens or latents are sampled; 0 takes the most likely ones. Default: as in
+            RUN/decode.json, or 0.
         recorded: Also write the recordings of the same episodes in the same layout, as ROBOT_recorded or NAME_recorded,
             so that policies can be trained on both.
         allow_clipping: Replay actions even if most values of one of them lie outside the robot's range.

@@ -84,7 +84,7 @@ def judge(
         diffusion: Number of checkpoints of the Diffusion Policy, 0 for none. Default: 3, with --recordings none.
         seed: Random seed of recordings, training and episodes.
         labels: File that the blind page saved. Only prints how often that person agrees with the results in --out;
-            all other options are ignored.
+            --robot must be given, and all other options are ignored.
     """
     if labels is not None:
         _show_agreement_with_labels(labels, out)

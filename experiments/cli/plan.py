@@ -12,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg
 from experiments.cli.bench.arguments import Model
 from experiments.study_setup import UNSET, Preset, StudyArguments, make_setup
 from experiments.terminal.progress import console, say, step, tidy_table
-from experiments.terminal.words import counted
+from experiments.terminal.words import counted, in_thousands
 from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.execution import Dtype, Remat
 
@@ -80,6 +80,7 @@ def plan(
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # programs for absent devices cannot be written
     from experiments.bench.collectives import count_kinds
     from experiments.bench.plan import find_devices, make_plan
+    from experiments.dry_run.plan_table import flops_of
     from hma_jax.runtime.audit import size_of
 
     what, config, table, train, execution = _choose_model(arguments, shape)
@@ -94,9 +95,9 @@ def plan(
             _print_sent(name, made, execution.accumulate)
     averaged = train.ema_decay > 0
     report = tidy_table(
-        f"{what}: {rows[0][1].parameters / 1e6:,.1f} M parameters, batch {train.batch}, {execution.dtype}, "
+        f"{what}: {in_thousands(rows[0][1].parameters)} parameters, batch {train.batch}, {execution.dtype}, "
         f"remat {execution.remat}; per device:",
-        "topology", "mesh", "parameters", "moments", *["average"] * averaged, "activations", "peak", "TFLOP/step",
+        "topology", "mesh", "parameters", "moments", *["average"] * averaged, "activations", "peak", "per step",
         "verdict",
     )  # fmt: skip
     for name, made in rows:
@@ -107,7 +108,7 @@ def plan(
         verdict = "" if name == "local" and limit is None else "fits"
         if made.refusal or limit is not None and made.peak > limit:
             verdict = "[red]does not fit[/]"
-        report.add_row(name, shape, *shown, f"{made.flops_per_step / made.devices / 1e12:,.1f}", verdict)
+        report.add_row(name, shape, *shown, flops_of(made.flops_per_step / made.devices), verdict)
     console.print(report)
     for name, made in rows:
         if made.refusal:

@@ -82,7 +82,7 @@ def plan_table(
             *columns,
             in_thousands(cost.parameters),
             in_thousands(cost.parameters_one_robot),
-            "" if over else _flops(plan.flops).removesuffix("FLOP"),
+            "" if over else flops_of(plan.flops).removesuffix("FLOP"),
             over or duration(plan.seconds),
         )
     return table
@@ -135,8 +135,8 @@ def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before:
     shared = " Training that trials share is counted once." if several else ""
     control = " 'Control': trained on shuffled actions." if several else ""
     return (
-        f"{whole}. {_flops(flops)} {judged}, priced for {number:g} device{'s' * (number != 1)}{each} at "
-        f"{_flops(study.flops_per_second)}/s each (flops_per_second); {held} "
+        f"{whole}. {flops_of(flops)} {judged}, priced for {number:g} device{'s' * (number != 1)}{each} at "
+        f"{flops_of(study.flops_per_second)}/s each (flops_per_second); {held} "
         f"with {study.trial_seconds:g} s for each to start, compile, decode and write (trial_seconds). "
         f"Checkpoints: {size_of(sum(map(checkpoint_bytes, plans)))}.{shared} 'One robot': parameters with a single "
         f"embodiment of 2 action dimensions. 'Videos' are per dataset.{control}"
@@ -167,7 +167,8 @@ def _short_count(n: int) -> str:
     return f"{n // 1_000_000:,} M" if n >= 1_000_000 and n % 1_000_000 == 0 else f"{n:,}"
 
 
-def _flops(value: float) -> str:
+def flops_of(value: float) -> str:
+    """'48.0 MFLOP', '1.2 TFLOP'."""
     for unit, size in (("E", 1e18), ("P", 1e15), ("T", 1e12), ("G", 1e9)):
         if value >= size:
             return f"{value / size:,.1f} {unit}FLOP"

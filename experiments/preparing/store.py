@@ -19,7 +19,7 @@ from experiments.preparing.sources import (
 from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.terminal.progress import Eta, say, step
-from experiments.terminal.words import few
+from experiments.terminal.words import counted, few
 from hma_jax.config import ConfigError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def make_store(
         )  # fmt: skip
         return manifest is not None
 
-    with step(f"tokenise {len(sources)} dataset(s)") as update:
+    with step(f"tokenise {counted(len(sources), 'dataset')}") as update:
         for i in [i for i in range(len(sources)) if not make(i, wait=False)]:
             make(i, wait=True)
 

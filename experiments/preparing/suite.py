@@ -11,7 +11,7 @@ from experiments.preparing.sources import Source
 from experiments.running.workspace import Workspace
 from experiments.study import Study, SuiteConfig
 from experiments.terminal.progress import say, step
-from experiments.terminal.words import few
+from experiments.terminal.words import counted, few
 from hma_jax.config import require
 from hma_jax.runtime.cores import usable_cores
 
@@ -46,7 +46,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
     found = {name: _differences(name, workspace.suite / name / VERSION, study.suite) for name in names}
     require_same("suite", workspace.suite, _lines(found), replace)
     kept = [] if may_replace("suite", replace) else [name for name in names if found[name] == []]
-    with step(f"simulate {len(names)} datasets") as update:
+    with step(f"simulate {counted(len(names), 'dataset')}") as update:
         generate_suite(
             workspace.suite,
             scale=study.suite.scale,

@@ -22,6 +22,7 @@ from data_pipelines.tokens.row_sample import QUANTILES
 from experiments.report.drawings import clip, curves, histogram, lengths
 from experiments.report.pieces import STILL, table
 from experiments.report.style import CSS
+from experiments.terminal.words import counted
 
 FASTEST = 4.0
 """Clips play at the recorded speed, or faster (by at most this factor) if they would take longer than LONGEST."""
@@ -103,8 +104,8 @@ def _summary(datasets: Sequence[DatasetView], frames: int) -> str:
     for i, d in enumerate(datasets):
         f, windows = d.facts, _windows(d, frames)
         errors, warnings = (sum(r.severity == severity for r in d.issues) for severity in ("error", "warning"))
-        stands = [f'<span class="failed">{errors} error(s)</span>'] * bool(errors)
-        stands += [f"{warnings} warning(s)"] * bool(warnings)
+        stands = [f'<span class="failed">{counted(errors, "error")}</span>'] * bool(errors)
+        stands += [counted(warnings, "warning")] * bool(warnings)
         lines.append([
             f'<a href="#d{i}">{html.escape(f.name)}</a>',
             ", ".join(stands) or "<span class=fine>no issues found</span>",
@@ -115,8 +116,8 @@ def _summary(datasets: Sequence[DatasetView], frames: int) -> str:
             f"{windows.total:,.0f}" if windows else "?",
             f"{d.entry.action_dim}" if d.entry else "?",
         ])  # fmt: skip
-    counted = f"windows, T = {frames}"
-    head = ["dataset", "issues", "episodes", "median steps", "Hz", "Hz of frames", counted, "action values"]
+    names = ["dataset", "issues", "episodes", "median steps", "Hz", "Hz of frames", f"windows, T = {frames}"]
+    head = [*names, "action values"]
     return table(head, lines, text=2)
 
 

@@ -74,7 +74,7 @@ th:first-child, .findings td:first-child { white-space: normal; min-width: 7rem;
 .moving, .still { display: contents; } .still, body:has(#pause:checked) .moving { display: none; }
 body:has(#pause:checked) .still { display: contents; }
 @media (prefers-reduced-motion: reduce) { .moving, .pause { display: none; } .still { display: contents; } }
-@media (max-width: 560px) { th:first-child, .findings td:first-child { max-width: 9rem; }
+@media (max-width: 560px) { th:first-child, .findings td:first-child { max-width: 9rem; overflow-wrap: anywhere; }
   main { padding: 1.2rem .9rem 3rem; } h1 { font-size: 1.5rem; }
   .cards { grid-template-columns: repeat(2, minmax(0, 1fr)); }
   .card { padding: .6rem .7rem; } .card b { font-size: 1.15rem; } .card b .sem { font-size: .8rem; }

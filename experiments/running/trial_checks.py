@@ -12,7 +12,7 @@ from experiments.running.job import trial_in
 from experiments.running.provenance import CodeChanged, read_record
 from experiments.running.result_file import read_result
 from experiments.running.trial import trial_id
-from experiments.terminal.words import few
+from experiments.terminal.words import counted, few
 from hma_jax.config import require
 from hma_jax.training.run_lock import CHECKPOINTS
 
@@ -80,7 +80,7 @@ def describe(groups: list[Sources]) -> list[str]:
     """A line for each group; from the second on, what differs from the first."""
     lines = []
     for group in groups:
-        count = f"{len(group.trials)} trial(s)" if group.trials else "to be run"
+        count = counted(len(group.trials), "trial") if group.trials else "to be run"
         where = f" (commit {', '.join(group.commits)})" if group.commits else ""
         names = changed(groups[0].modules, group.modules)
         differs = f"; differs in {few(names)}" if names else ""

@@ -258,7 +258,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, capsys):
 
 
 def test_memory_gives_a_verdict_where_the_compiler_has_none(planned):
-    for memory, verdict in (((), "1.0"), (("--memory", "4GiB"), "fits"), (("--memory", "3GiB"), "does not fit")):
+    for memory, verdict in (((), "1.0 TFLOP"), (("--memory", "4GiB"), "fits"), (("--memory", "3GiB"), "does not fit")):
         assert planned(*memory)[1].endswith(verdict)
 
 

@@ -12,6 +12,7 @@ from experiments.cli.arguments import StudyOptions
 from experiments.cli.bench.record import write
 from experiments.study_setup import UNSET, make_setup
 from experiments.terminal.progress import console, step, tidy_table
+from experiments.terminal.words import counted
 from hma_jax.config import ConfigError, require
 from hma_jax.config.execution import Dtype
 
@@ -111,7 +112,7 @@ def tokenize(
 
     with step(f"make {tokenizer}"):
         made = make_tokenizer(tokenizer, dtype, piece, seed)
-    with step(f"time {tokenizer} on {made.at_once} image(s) at a time"):
+    with step(f"time {tokenizer} on {counted(made.at_once, 'image')} at a time"):
         stages = time_tokenizer(made, repeats, seed)
     settings = {"tokenizer": made.config, "piece": made.at_once}
     write("tokenize", Path(tokenizer).name, dtype, seed, settings, stages, {}, (), out)

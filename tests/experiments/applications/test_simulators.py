@@ -243,7 +243,7 @@ def test_what_is_there_stays_until_all_of_the_new_one_is(run, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        ship(run, out, add=stop)
+        ship(run, out, add=stop, replace=True)
     assert (out / "report.json").read_text() == "known"
     assert [path.name for path in tmp_path.rglob("*")] == ["simulator", "report.json"]
 
@@ -253,8 +253,20 @@ def test_what_was_not_shipped_is_not_replaced(run):
     before = sorted(run.parent.rglob("*"))
     for out in (run, run.parent):
         with pytest.raises(ConfigError, match=r"has no report.json, so .* it would be overwritten"):
-            ship(run, out)
+            ship(run, out, replace=True)
     assert sorted(run.parent.rglob("*")) == before
+
+
+def test_a_shipped_model_is_replaced_only_on_request(run, tmp_path):
+    """A documented command replaced a committed model by whatever the user had trained."""
+    out = tmp_path / "simulator"
+    out.mkdir()
+    (out / "report.json").write_text("known")
+    with pytest.raises(ConfigError, match="holds a shipped model; choose another --out, or add --replace"):
+        ship(run, out)
+    assert [path.name for path in out.iterdir()] == ["report.json"]
+    ship(run, out, replace=True)
+    assert not (out / "report.json").exists() and (out / "robots.json").exists()
 
 
 def test_a_robot_without_a_truth_to_be_compared_with_is_not_shipped(tmp_path):
