@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.sources.parquet_pages import RowGroup, check_pages, read_groups
 from data_pipelines.sources.rlds.location import is_io_error, retry
 
 T = TypeVar("T")
@@ -29,14 +28,17 @@ CACHE_BYTES = 64 * 2**20
 MAX_LAYOUTS = 256
 """Files whose layout is cached: some kilobytes each."""
 
+MAX_UNPACKED, MAX_RATIO = 256 * 2**20, 32
+"""A file with a row group that unpacks to more bytes than this, and to more than this many times the file's size, is
+not read: a small file could take all memory. States of a robot that hardly moves compress to an eighth."""
+
 
 @dataclass(frozen=True)
 class _Layout:
-    """The row groups of a file, and the runs of equal values in its column of labels. `ends` int64 [groups]: the number
-    of rows up to and including each group."""
+    """The runs of equal values in a file's column of labels. `ends` int64 [row groups]: the number of rows up to and
+    including each group."""
 
     columns: tuple[str, ...]
-    groups: tuple[RowGroup, ...]
     ends: np.ndarray
     labels: np.ndarray  # [runs]: the value of each run
     starts: np.ndarray  # int64 [runs + 1]: first row of each run, and at the end the number of rows
@@ -117,13 +119,9 @@ class ParquetRows:
 
 def read_table(path: Path, columns: Collection[str]) -> Any:
     """All rows of a file, as a pyarrow table with those of `columns` that it has. Raises what `ParquetRows` raises."""
-    from pyarrow import parquet
 
     def read() -> Any:
-        with path.open("rb") as file:
-            groups = read_groups(file)
-            check_pages(file, [chunk for group in groups for name in columns for chunk in group.columns.get(name, ())])
-        with parquet.ParquetFile(path) as file:
+        with _open(path) as file:
             table = file.read(columns=list(columns))
         table.column_names  # noqa: B018  fails here if they are not text
         return table
@@ -140,38 +138,41 @@ def _reading(path: Path, read: Callable[[], T]) -> T:
         except (OSError, ValueError, arrow.ArrowException) as error:
             if is_io_error(error):
                 raise  # to be tried again
-            raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
+            reason = str(error).strip().partition("\n")[0]
+            raise DataError(f"{path}: the table cannot be read ({reason}). {ADVICE}") from error
 
     return retry(path, attempt)
 
 
-def _read_layout(path: Path, label: str) -> _Layout:
+def _open(path: Path) -> Any:
+    """The pyarrow.parquet.ParquetFile. Raises ValueError if, as its footer says, a row group unpacks to too much."""
     from pyarrow import parquet
 
-    with path.open("rb") as file:
-        groups = read_groups(file)
-        check_pages(file, [chunk for group in groups for chunk in group.columns.get(label, ())])
-    rows = np.asarray([group.rows for group in groups], np.int64)
-    with parquet.ParquetFile(path) as file:
+    file, size = parquet.ParquetFile(path), path.stat().st_size
+    # The sizes of single columns are not looked at: over some damaged footers, pyarrow's `column` ends the process.
+    for g in range(file.num_row_groups):
+        if (unpacked := file.metadata.row_group(g).total_byte_size) > max(MAX_UNPACKED, MAX_RATIO * size):
+            raise ValueError(f"its {size:,} bytes unpack to {unpacked:,}")
+    return file
+
+
+def _read_layout(path: Path, label: str) -> _Layout:
+    with _open(path) as file:
+        rows = np.array([file.metadata.row_group(g).num_rows for g in range(file.num_row_groups)], np.int64)
         columns = tuple(file.schema_arrow.names)
         values = np.asarray(file.read([label])[label]) if label in columns else np.zeros(0, np.int64)
     if (rows < 0).any() or len(values) not in (0, rows.sum()):
         raise ValueError(f"its row groups have {rows.tolist()} rows, but {label} has {len(values)}")
     starts = np.flatnonzero(np.append(True, values[1:] != values[:-1])[: len(values)])
-    return _Layout(columns, tuple(groups), np.cumsum(rows), values[starts], np.append(starts, len(values)))
+    return _Layout(columns, np.cumsum(rows), values[starts], np.append(starts, len(values)))
 
 
 def _read_groups(path: Path, layout: _Layout, wanted: dict[int, list[str]]) -> dict[int, dict[str, Any]]:
-    from pyarrow import parquet
-
-    with path.open("rb") as file:
-        chunks = [layout.groups[g].columns.get(name, ()) for g, names in wanted.items() for name in names]
-        check_pages(file, [chunk for place in chunks for chunk in place])
-    found = {}
-    with parquet.ParquetFile(path) as file:
+    found, rows = {}, np.diff(layout.ends, prepend=0)
+    with _open(path) as file:
         for g, names in wanted.items():
             table = file.read_row_group(g, columns=names)
-            if table.num_rows != layout.groups[g].rows:
-                raise ValueError(f"a row group of {layout.groups[g].rows} rows has {table.num_rows}")
+            if table.num_rows != rows[g]:
+                raise ValueError(f"a row group of {rows[g]} rows has {table.num_rows}")
             found[g] = {name: table[name] for name in names}
     return found
