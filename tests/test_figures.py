@@ -360,7 +360,7 @@ def test_claims_of_robots_and_actions_come_with_their_controls():
 
 
 def test_readme_is_read_in_a_few_minutes():
-    words = README.read_text().replace("|", " ").split()
+    words = [word for word in README.read_text().replace("|", " ").split() if word.strip("-:")]  # no rules of tables
     assert len(words) <= 900
 
 

@@ -80,10 +80,14 @@ def test_the_axis_horizon_is_as_findings_say():
     ((control, _),) = robots_at("cpu-full", "horizon", CONTROL).values()
     _, *by_chance = counts(control)
     said = (
-        f"raise the loss on all {follow} robots that have actions; random ones lower PSNR on {changed} (beyond 3 and 2 "
-        f"standard errors; control of 4,000 steps: {by_chance[0]} and {by_chance[1]}) |"
+        f"raise the loss by more than 3 standard errors on all {follow} robots with actions (control of 4,000 steps: "
+        f"{by_chance[0]}); random ones lower PSNR by more than 2 on {changed} (control: {by_chance[1]}) |"
     )
     assert follow == "36" and said in readme(), said
+    trained = {steps: trials for steps, (_, trials) in robots_at("cpu-full", "horizon").items()}
+    ((_, controls),) = robots_at("cpu-full", "horizon", CONTROL).values()
+    assert trained[16_000] == 3 and trained[32_000] == controls == 1
+    assert "three seeds (controls, ≥32,000 steps: one);" in readme()
     assert f"PSNR, copying {copying} dB" in page
     alone = [counts(robots_at("cpu-full", "horizon", seed=seed, at=16_000)[16_000][0])[2] for seed in (0, 1, 2)]
     said = "Counted so, the single seeds of 16,000 steps have ΔPSNR beyond 2 on {}, {} and {} robots."
@@ -324,8 +328,8 @@ def test_what_was_found_is_as_readme_says():
     came = next(line for line in axis_rows("width") if line.startswith("| 64 |")).split(" | ")[2]
     assert f"predicted at {predicted} before it ran, came to {came}" in text
     alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
-    bring = f"falls by {company} if these bring their own (the five alone, trained as long, are {alone} ahead)"
-    assert f"loss of five rises by {alone} nats if" in text and bring in text
+    bring = f"lower it by {company} if they bring their own (the five alone, trained as long, are {alone} ahead)"
+    assert f"raise the loss of five by {alone} nats if they share" in text and bring in text
     poor = {p.label: p for p in curve(rows_of(root.name), "newcomers", "cross_entropy")}
     gained, error = difference(poor["alone"], poor["all robots"])
     (control,) = curve(rows_of(root.name), "newcomers", "cross_entropy", CONTROL)

@@ -90,7 +90,7 @@ def test_how_many_robots_of_the_ladder_follow_is_as_its_findings_say():
     gain = np.mean([r.ahead for r in robots_at("ladder", "ladder")[x][0]])
     psnr = curve(rows_of("ladder"), "ladder", "psnr")[x].mean
     share, _, _ = in_place(in_place_rows("ladder-64000"), "model")
-    assert f"a better recipe and 64,000 come to {psnr:.2f} dB and {100 * share:.0f} %" in readme()
+    assert f"a better recipe and 64,000: {100 * share:.0f} % ({psnr:.2f} dB)" in readme()
     assert f"64,000 steps, is {gain:.2f} dB ahead of copying**, on {found[labels[x]][0]} of 40 robots" in " ".join(page)
 
 

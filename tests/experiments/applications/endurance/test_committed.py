@@ -190,7 +190,7 @@ def test_what_drawing_tokens_does_is_as_the_page_says():
     later, end = range(2, 11), range(10, 11)
     last, tools = [share(of, end) for of in (drawn, grown)], share(drawn, end, measure="tool_found")
     readme = words_of(ROOT / "README.md")
-    greedy = f"objects, greedy decoding: {last[1]} % (not significant)"
+    greedy = f"objects, greedy decoding: {last[1]} % (difference not significant)"
     assert f"| {last[0]} % of objects, {tools} % of tools | {greedy} |" in readme
     said = "objects are found in {} % of the frames of the last minute, in {} % with greedy decoding"
     assert said.format(*last) in words_of(ROOT / "docs" / "results.md")
