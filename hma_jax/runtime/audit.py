@@ -12,7 +12,7 @@ import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.runtime.sharding import mesh_axes, partition, storage_partition
+from hma_jax.runtime.sharding import STORAGE, mesh_axes, partition, storage_partition
 
 
 class Spec(Protocol):
@@ -43,7 +43,7 @@ class Decision:
     storage: PartitionSpec
     compute: PartitionSpec
     device_size: int  # elements that each device stores
-    whole: bool  # not split along `fsdp`, or along `tensor` where only that axis splits parameters
+    whole: bool  # not split along `splitting_axis`
     reason: str  # why it is whole; "" if it is not
 
     @property
@@ -52,15 +52,22 @@ class Decision:
         return ", ".join(f"{axis or '-'} {size}" for axis, size in zip(self.spec.axes, self.spec.shape, strict=True))
 
 
-SMALL = "small"
+SMALL, NO_RULE, UNDIVIDED = "small", "no rule splits it", "no axis divides"
+"""Reasons for which a parameter is whole. Only the last is the fault of the mesh's sizes."""
 
 MAX_WHOLE = 0.02
-"""The largest share of all parameters that may be whole on every device, not counting small ones."""
+"""The largest share of all parameters that may be whole because the mesh's sizes do not divide theirs."""
+
+
+def splitting_axis(mesh: Any) -> str:
+    """The mesh axis that has to split parameters: `fsdp`, or `tensor` where only that axis could."""
+    return "fsdp" if mesh.shape["fsdp"] > 1 else "tensor"
 
 
 def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list[Decision]:
     """One decision per parameter, in the order of `declared.leaves()`. Only the shape of `mesh` is read."""
-    splitting = "fsdp" if mesh.shape["fsdp"] > 1 else "tensor"
+    splitting = splitting_axis(mesh)
+    splittable = {axis for axis, names in STORAGE if splitting in names}
     decisions = []
     for name, spec in declared.leaves().items():
         storage = storage_partition(spec.axes, spec.shape, mesh, config.min_shard_size)
@@ -68,7 +75,8 @@ def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list
         whole = splitting not in _mesh_axes(storage)
         reason = ""
         if whole:
-            reason = SMALL if spec.size < config.min_shard_size else "no axis divides"
+            small, ruled = spec.size < config.min_shard_size, splittable.intersection(spec.axes)
+            reason = SMALL if small else UNDIVIDED if ruled else NO_RULE
         compute = partition(spec.axes, spec.shape, mesh)
         decisions.append(Decision(name, spec, storage, compute, spec.size // ways, whole, reason))
     return decisions
@@ -77,20 +85,22 @@ def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list
 def audit_sharding(decisions: list[Decision], mesh: Any) -> None:
     """Raises ConfigError, which names the parameters, when more than MAX_WHOLE of them is whole.
 
-    Only a mesh that splits parameters (fsdp or tensor above 1) is audited. Parameters that are whole because
-    they are small (`MeshConfig.min_shard_size`) do not count.
+    Only a mesh that splits parameters (fsdp or tensor above 1) is audited. Parameters do not count that are whole
+    because they are small (`MeshConfig.min_shard_size`), or because no size of the mesh would split them, such as
+    position tables where only tensor is above 1.
     """
-    if mesh.shape["fsdp"] * mesh.shape["tensor"] == 1:
+    splitting = splitting_axis(mesh)
+    if mesh.shape[splitting] == 1:
         return
     total = sum(d.spec.size for d in decisions)
-    whole = [d for d in decisions if d.whole and d.reason != SMALL]
+    whole = [d for d in decisions if d.reason == UNDIVIDED]
     share = sum(d.spec.size for d in whole) / total
     if share > MAX_WHOLE:
         worst = sorted(whole, key=lambda d: -d.spec.size)[:5]
         raise ConfigError(
             f"{share:.1%} of the parameters would be replicated on every device (allowed: {MAX_WHOLE:.0%}): "
             + ", ".join(f"{d.name} {d.spec.shape}" for d in worst)
-            + "; no mesh axis divides their sizes: choose sizes of fsdp and tensor that do"
+            + f"; {splitting}={mesh.shape[splitting]} divides no size of theirs that it may split: choose one that does"
         )
 
 

@@ -72,6 +72,25 @@ def test_a_width_that_does_not_divide_is_reported_not_replicated_in_silence():
         audit_sharding(decisions, mesh)
 
 
+MESHES_OF_EIGHT = [
+    (data, fsdp, 8 // data // fsdp) for data in (1, 2, 4, 8) for fsdp in (1, 2, 4, 8) if data * fsdp <= 8
+]
+
+
+@pytest.mark.parametrize("mesh", MESHES_OF_EIGHT, ids=str)
+@pytest.mark.parametrize("heads", [False, True], ids=["frames", "frames and actions"])
+@pytest.mark.parametrize("diffusion", [None, DiffusionConfig()], ids=["ids", "latents"])
+def test_every_mesh_of_eight_devices_fits_the_base_models_of_one_robot(diffusion, heads: bool, mesh):
+    declared = declare_model(ModelConfig(diffusion=diffusion, action_heads=heads), make_table(1))
+    audit_sharding(plan_sharding(declared, fake_mesh(*mesh), MeshConfig()), fake_mesh(*mesh))
+
+
+def test_a_size_of_tensor_that_divides_no_width_is_refused_by_its_name():
+    declared = declare_model(ModelConfig(mlp_ratio=1025 / 256), make_table(1))
+    with pytest.raises(ConfigError, match="mlp_in/kernel .*; tensor=8 divides no size of theirs that it may split"):
+        audit_sharding(plan_sharding(declared, fake_mesh(1, 1, 8), MeshConfig()), fake_mesh(1, 1, 8))
+
+
 def test_an_array_that_is_split_along_tensor_alone_counts_as_whole_under_fsdp():
     """Every device along fsdp would hold a copy."""
     declared = declare_model(model_config(width=36, heads=6), TABLE)
