@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, Facts
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.registry.angles import AngleForm, AngleUnit
 from data_pipelines.registry.spec import MAX_STRIDE
+from data_pipelines.registry.toml_file import to_toml
 from data_pipelines.sources.convertible import unsupported_images_text
 from data_pipelines.sources.rlds.schema import METADATA, RATE_KEY, field_slice
 from data_pipelines.sources.source import NO_ACTION, action_fields
@@ -65,30 +66,12 @@ class Suggestion:
             episodes=self.episodes, mean_steps=self.mean_steps,
         )  # fmt: skip
 
-    def python(self) -> str:
-        """Text that pastes into the table `OWN` of data_pipelines/registry/own.py."""
-        rate = f"{self.hz:g}," if self.hz else "0,  # FILL IN: frames per second of the recording"
-        lines = [
-            "    DatasetSpec(",
-            f"        {_text(self.name)},",
-            f"        image_key={_text(self.image_key)},",
-            f"        action_keys={_tuple(map(_text, self.action_keys))},",
-            f"        action_dims={_tuple(map(str, self.action_dims))},",
-            f"        hz={rate}",
-        ]
-        if self.split != "train":
-            lines.append(f"        split={_text(self.split)},")
-        if not self.video_targets:
-            lines.append("        video_targets=False,  # its camera shows nothing")
-        if self.version:
-            lines.append(f"        version={_text(self.version)},")
-        if self.angles:
-            lines.append(f"        angles={_tuple(map(str, self.angles))},  # they wrap")
-            lines.append(f'        angle_form={_text(self.angle_form)},  # or "unwrapped"')
-            if self.angle_unit != "radian":
-                lines.append(f"        angle_unit={_text(self.angle_unit)},")
-        lines += [f"        episodes={self.episodes},", f"        mean_steps={self.mean_steps},"]
-        return "\n".join([*lines, "    ),"])
+    def table(self) -> str:
+        """The table of the entry in a file for --registry; where the rate is missing, it says so."""
+        if self.hz:
+            return to_toml(self.spec())
+        table = to_toml(replace(self, hz=1.0).spec())
+        return table.replace("\nhz = 1.0\n", "\nhz = 0  # FILL IN: frames per second of the recording\n")
 
 
 @dataclass(frozen=True)
@@ -217,12 +200,3 @@ def window_facts(facts: Facts, stride: int, frames: int) -> WindowFacts:
     return WindowFacts(
         frames, stride, slicer.native_frames, min_real * stride, whole, some, mean, mean * facts.episodes
     )
-
-
-def _text(value: str) -> str:
-    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
-def _tuple(values) -> str:
-    items = list(values)
-    return f"({', '.join(items)}{',' if len(items) == 1 else ''})"

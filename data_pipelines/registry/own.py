@@ -1,6 +1,6 @@
 """Entries of one's own, and of three small samples of real robot data.
 
-A dataset of one's own is one more `DatasetSpec` here; `hma data inspect DIR` suggests it. For
+A dataset of one's own is one more `DatasetSpec` here; `hma data inspect DIR` suggests its fields. For
 entries outside this project see `toml_file`.
 """
 

@@ -18,8 +18,7 @@ MAX_LISTED = 12
 """Number of names in a message; `hma data list` shows all."""
 
 NEW_DATASET = (
-    "A new dataset needs an entry, in data_pipelines/registry/own.py or in a file given with --registry: `hma data "
-    "inspect DIR` suggests it."
+    "A new dataset needs an entry in a file given with --registry; `hma data inspect DIR --entry FILE.toml` writes one."
 )
 """What to do about a dataset that no entry describes."""
 

@@ -42,9 +42,8 @@ def test_a_conversion_says_what_it_wrote_the_entry_and_what_is_next(tmp_path, ca
     out = said(capsys)
     assert "3 episodes at 20 Hz in 1 shards" in out
     assert (
-        'DatasetSpec("robomimic_lift", image_key="observation/agentview", action_keys=("action",), '
-        "action_dims=(7,), hz=20)," in out
-    )
+        '["robomimic_lift"]\nimage_key = "observation/agentview"\naction_keys = ["action"]\naction_dims = [7]\nhz = 20.0'
+    ) in out
     assert "`--entry FILE.toml`" in out and "--registry" in out
     assert f"wrote {tmp_path}/rlds/robomimic_lift/1.0.0" in out
     assert f"next: hma data inspect {tmp_path}/rlds/robomimic_lift/1.0.0\n" in out
@@ -74,13 +73,14 @@ def test_an_export_leaves_out_as_many_damaged_episodes_as_there_are(tmp_path, ca
 
 
 def test_the_entry_can_be_pasted_and_reads_the_dataset(tmp_path, capsys):
-    from data_pipelines.registry import DatasetSpec
+    from data_pipelines.registry.toml_file import load_entries
     from data_pipelines.sources.rlds.dataset import RldsDataset
 
     root = write_lerobot(tmp_path / "My Robot", "v3.0")
     assert main(["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]) == 0
-    (line,) = [line for line in said(capsys).splitlines() if "DatasetSpec(" in line]
-    (spec,) = eval(f"({line.strip()})", {"DatasetSpec": DatasetSpec})
+    table = said(capsys).partition("with --registry:\n")[2].partition("\n\n")[0]
+    (tmp_path / "my.toml").write_text(table)
+    (spec,) = load_entries(tmp_path / "my.toml")
     assert (spec.name, spec.hz) == ("my_robot", 10)
     RldsDataset(tmp_path / "my_robot").check_keys(spec.image_key, spec.action_keys, spec.action_dims)
 

@@ -94,7 +94,7 @@ def test_unknown_dataset_goes_from_inspection_to_training_data(robot, tmp_path, 
     entries, sheets = str(tmp_path / "entries" / "my.toml"), str(tmp_path / "sheets")
     assert main(["data", "inspect", str(robot), "--hz", "4", "--entry", entries, "--out", sheets]) == 0
     said = capsys.readouterr().out
-    assert "not in the registry" in said and 'action_keys=("action[:3]",),' in said
+    assert "not in the registry" in said and 'action_keys = ["action[:3]"]\n' in said
     assert Image.open(tmp_path / "sheets" / "contact_sheet.png").height > 4 * TILE
     out = str(tmp_path / "out")
     common = ["--preset", "smoke", "--out", out, "--data", str(robot), "--set", "model.frames=4"]

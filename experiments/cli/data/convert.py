@@ -11,7 +11,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from data_pipelines.errors import DataError, without_advice
 from data_pipelines.names import made_name
-from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry.toml_file import to_toml
 from data_pipelines.sources.settings import (
     Ego4dSettings,
     EgoExo4dSettings,
@@ -159,20 +159,11 @@ def _convert(
     if unsupported_images:
         say(unsupported_images_text(unsupported_images))
     say(
-        "to read it, a registry entry of this name is needed: add `--entry FILE.toml` to the next command, and give "
-        "that file to all others with --registry; or add this to data_pipelines/registry/own.py:"
+        "to read it, this registry entry is needed: add `--entry FILE.toml` to the next command, or write the entry into "
+        "such a file, and give that file to all others with --registry:"
     )
-    say(f"    {entry(done.spec)}")
+    say(to_toml(done.spec))
     wrote(done.directory, then=command("data inspect", done.directory))
-
-
-def entry(spec: DatasetSpec) -> str:
-    """The registry entry, as Python code for data_pipelines/registry/own.py."""
-    keys, dims = (f"({', '.join(map(repr, v))},)".replace("'", '"') for v in (spec.action_keys, spec.action_dims))
-    return (
-        f'DatasetSpec("{spec.name}", image_key="{spec.image_key}", action_keys={keys}, '
-        f"action_dims={dims}, hz={spec.hz:g}),"
-    )
 
 
 def import_tokens(

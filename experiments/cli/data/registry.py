@@ -291,11 +291,8 @@ def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> No
             return
     for reason in suggestion.reasons:
         say(f"  {reason}")
-    say(suggestion.python())
-    say(
-        "Copy it into data_pipelines/registry/own.py, or write it with --entry FILE.toml and give that file "
-        "to other commands with --registry."
-    )
+    say(suggestion.table())
+    say("Write it to a file with --entry FILE.toml, and give that file to other commands with --registry.")
 
 
 def _in_words(spec: DatasetSpec) -> str:

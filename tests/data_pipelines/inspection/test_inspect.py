@@ -15,8 +15,9 @@ from data_pipelines.inspection.action_stats import dimension_facts
 from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, inspect_dataset
 from data_pipelines.inspection.issues import find_issues
 from data_pipelines.inspection.suggest import choose_camera, suggest_entry, window_facts
-from data_pipelines.registry import DatasetSpec, get_spec
+from data_pipelines.registry import get_spec
 from data_pipelines.registry.own import OWN
+from data_pipelines.registry.toml_file import load_entries
 from data_pipelines.sources.lerobot_dataset import LeRobotDataset
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from hma_jax.config import ConfigError
@@ -123,7 +124,7 @@ def test_blank_camera_is_recognised_and_not_offered_as_a_target(tmp_path):
     directory = write_rlds(tmp_path, make_spec(), [5, 5], change=change)
     facts = inspect_dataset(directory).facts
     assert facts.cameras[0].is_blank and facts.cameras[0].still
-    assert "video_targets=False" in suggest_entry(facts, 4).python()
+    assert "video_targets = false\n" in suggest_entry(facts, 4).table()
 
 
 def test_damaged_episode_is_counted_not_fatal(tmp_path):
@@ -413,20 +414,25 @@ def test_camera_that_sees_from_outside_is_chosen(cameras, chosen):
     assert choose_camera(cameras)[0].key == f"observation/{chosen}"
 
 
-def test_suggested_python_is_an_entry_that_reads_the_dataset(toy):
+def test_suggested_table_is_an_entry_that_reads_the_dataset(toy, tmp_path):
     facts = inspect_dataset(toy).facts
     suggestion = suggest_entry(facts, 4)
-    (spec,) = eval(f"({suggestion.python()})", {"DatasetSpec": DatasetSpec})  # what pasting it does
+    (tmp_path / "my.toml").write_text(suggestion.table())
+    (spec,) = load_entries(tmp_path / "my.toml")
     assert spec == suggestion.spec()
     assert (spec.action_keys, spec.action_dims, spec.hz) == (("action[:2]",), (2,), 4)
     assert (spec.episodes, spec.mean_steps) == (facts.episodes, round(np.mean(facts.steps), 1))
 
 
-def test_without_a_rate_the_entry_says_where_it_is_missing(toy):
-    suggestion = suggest_entry(inspect_dataset(toy).facts, None)
-    assert "FILL IN" in suggestion.python() and any("--hz" in reason for reason in suggestion.reasons)
+def test_without_a_rate_the_entry_says_where_it_is_missing(toy, tmp_path):
+    facts = inspect_dataset(toy).facts
+    suggestion, file = suggest_entry(facts, None), tmp_path / "my.toml"
+    assert "hz = 0  # FILL IN" in suggestion.table() and any("--hz" in reason for reason in suggestion.reasons)
+    file.write_text(suggestion.table())
     with pytest.raises(ConfigError, match="hz, the native rate, must be positive"):
-        eval(f"({suggestion.python()})", {"DatasetSpec": DatasetSpec})
+        load_entries(file)
+    file.write_text(suggestion.table().replace("hz = 0", "hz = 4"))
+    assert load_entries(file) == (suggest_entry(facts, 4).spec(),)
 
 
 def test_dict_actions_are_suggested_field_by_field(tmp_path):

@@ -171,7 +171,7 @@ def test_unknown_dataset_name(tmp_path, refused):
     rlds = write_rlds(tmp_path, make_spec("berkeley_gnm_cory_hal", (2,)), LENGTHS)
     message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
     assert "unknown dataset 'berkeley_gnm_cory_hal'; did you mean berkeley_gnm_cory_hall" in message
-    assert "data_pipelines/registry/own.py" in message and "hma data inspect" in message
+    assert "`hma data inspect DIR --entry FILE.toml` writes one" in message
 
 
 def test_all_datasets_without_an_entry_and_all_that_are_none_are_named_at_once(tmp_path, refused):
