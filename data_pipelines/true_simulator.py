@@ -19,8 +19,9 @@ from hma_jax.simulator.interface import (
     Actions,
     WholeNumbers,
     chosen_episodes,
-    each_start,
+    each_beginning,
     read_only,
+    require_actions_between,
     whole_numbers,
 )
 from hma_jax.simulator.robots import Outside, Robot
@@ -57,6 +58,7 @@ class TrueSimulator(ABC, Generic[W]):
     def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int = 64, outside: Outside = "clip"):
         """Raises ConfigError for robots that do not exist here or have other actions."""
         [episodes] = whole_numbers("episodes", [episodes])
+        require(episodes >= 1, f"a simulator needs at least 1 episode, got {episodes}")
         require_choice(outside, get_args(Outside), "outside")
         for robot in robots:
             dim = self.dims().get(robot.name)
@@ -103,15 +105,14 @@ class TrueSimulator(ABC, Generic[W]):
         seeds: int | WholeNumbers = 0,
         episodes: WholeNumbers | None = None,
     ) -> np.ndarray:
-        """Begins at the last frames of `starts`, which must have the seeds of their episodes; `seeds` have no
-        effect."""
-        del seeds
+        """Begins at the last frames of `starts`, which must have the seeds of their episodes; `seeds` are checked, but
+        have no effect."""
         which = chosen_episodes(episodes, len(self))
-        each = each_start(starts, len(which))
-        require(len(each) == len(which), f"{len(which)} episodes need as many starts, got {len(each)}")
+        each, _ = each_beginning(starts, seeds, len(which))
         for start in each:
             require(start.robot in self.robots, f"no robot {start.robot!r} here; there are {', '.join(self.robots)}")
             require(start.seed is not None, f"the start of {start.robot} has no seed for the true simulator")
+            require_actions_between(start, self.robots[start.robot])
         for b, start in zip(which, each, strict=True):
             now = self._worlds[b]
             again = now is not None and now[1].name == start.robot

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from hma_jax.config import require
 from hma_jax.generation.episodes import Episodes
-from hma_jax.simulator.interface import read_only
+from hma_jax.simulator.interface import read_only, require_actions_between
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
@@ -51,12 +50,8 @@ def begin_episode(
 ) -> Episode:
     """The record of an episode that starts from at most the last `capacity` frames of `start`, with chunks padded to
     `width`. Its `frames` are still empty. Raises ConfigError for actions that do not fit the frames."""
+    require_actions_between(start, robot)
     between = len(start.images) - 1
-    require(
-        start.actions.shape == (between * robot.stride, robot.action_dim),
-        f"a start of {robot.name} with {between + 1} frames needs {between} x {robot.stride} actions of "
-        f"{robot.action_dim} values between them, got {start.actions.shape}",
-    )
     seen = min(between + 1, capacity)
     chunks = np.zeros((seen - 1, width), np.float32)
     flat = start.actions.reshape(between, robot.stride * robot.action_dim)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hma_jax.config import ConfigError, require
+from hma_jax.config.base import require_seed
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
@@ -99,6 +100,36 @@ def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
     others = [start for start in each if not isinstance(start, Start)]
     require(not others, f"an episode begins at a Start (see the simulator's `starts`), not at {others[:1]}")
     return each
+
+
+def each_beginning(
+    starts: Start | Sequence[Start], seeds: int | WholeNumbers, count: int
+) -> tuple[list[Start], list[int]]:
+    """A start and a seed for each of `count` episodes; if `seeds` is an int, that and those after it. Raises
+    ConfigError for another number of them, and for what they cannot be."""
+    each = each_start(starts, count)
+    if isinstance(seeds, (int, np.integer)):
+        [first] = whole_numbers("seeds", [seeds])
+        numbers = list(range(first, first + count))
+    else:
+        numbers = whole_numbers("seeds", seeds)
+    require(
+        len(each) == len(numbers) == count,
+        f"{count} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}",
+    )
+    for number in numbers:
+        require_seed(number, "seeds")
+    return each, numbers
+
+
+def require_actions_between(start: Start, robot: Robot) -> None:
+    """Raises ConfigError for a start whose actions do not fit its frames."""
+    between = len(start.images) - 1
+    require(
+        start.actions.shape == (between * robot.stride, robot.action_dim),
+        f"a start of {robot.name} with {between + 1} frames needs {between} x {robot.stride} actions of "
+        f"{robot.action_dim} values between them, got {start.actions.shape}",
+    )
 
 
 Judge = Callable[[Any], tuple[np.ndarray, np.ndarray]]

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, require
-from hma_jax.config.base import require_choice, require_seed
+from hma_jax.config.base import require_choice
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, find_robots, find_starts, find_tokenizer
@@ -27,7 +27,7 @@ from hma_jax.simulator.interface import (
     Actions,
     WholeNumbers,
     chosen_episodes,
-    each_start,
+    each_beginning,
     read_only,
     whole_numbers,
 )
@@ -187,17 +187,8 @@ class Simulator:
         b.
         """
         which = chosen_episodes(episodes, len(self))
-        each = each_start(starts, len(which))
-        if isinstance(seeds, (int, np.integer)):
-            [first] = whole_numbers("seeds", [seeds])
-            numbers = [first + i for i in range(len(which))]
-        else:
-            numbers = whole_numbers("seeds", seeds)
-        asked = f"{len(which)} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}"
-        require(len(each) == len(numbers) == len(which), asked)
-        for number in numbers:
-            require_seed(number, "seeds")
-        new = {b: self._new_episode(start, int(seed)) for b, start, seed in zip(which, each, numbers, strict=True)}
+        each, numbers = each_beginning(starts, seeds, len(which))
+        new = {b: self._new_episode(start, seed) for b, start, seed in zip(which, each, numbers, strict=True)}
         if not which:
             return self.images
         at = self._reset_inputs(which, (*self.tokenizer.image_shape, 3), np.uint8)

@@ -79,12 +79,31 @@ def test_what_is_refused_changes_no_episode():
         sim.rewind(0.5)
     with pytest.raises(ConfigError, match=r"episodes must be whole numbers, got \[1.5\]"):
         SuiteSimulator([PUSHER], episodes=1.5)
+    with pytest.raises(ConfigError, match="a simulator needs at least 1 episode, got 0"):
+        SuiteSimulator([PUSHER], episodes=0)
     with pytest.raises(ConfigError, match="has no seed for the true simulator"):
         sim.reset([start, unknown])
+    for seeds, message in (
+        ([1], "2 episodes need as many starts and seeds, got 2 and 1"),
+        ("ab", "seeds must be whole numbers, got 'ab'"),
+        ([-1, 0], "seeds must lie in .* got -1"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            sim.reset(start, seeds=seeds)
     with pytest.raises(ConfigError, match="in episode 1 at most 0 frames can be rewound"):
         sim.rewind(1)
     np.testing.assert_array_equal(sim.images, now)
     assert sim.max_rewind(0) == 1
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_a_start_of_another_stride_is_refused(stride):
+    """It began at another frame than the start's last."""
+    [start] = suite_starts("pusher_sand", 8, 3, stride=stride, most=1)
+    with pytest.raises(
+        ConfigError, match=rf"with 3 frames needs 2 x 2 actions of 2 values .*, got \({2 * stride}, 2\)"
+    ):
+        SuiteSimulator([PUSHER]).reset(start)
 
 
 def test_up_moves_the_pusher_up_and_right_to_the_right():
