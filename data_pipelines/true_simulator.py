@@ -164,6 +164,7 @@ class TrueSimulator(ABC, Generic[W]):
 
     def max_rewind(self, b: int) -> int:
         """Number of frames by which episode b can be rewound."""
+        self._begun(b)
         return len(self._before[b])
 
     def state(self, b: int) -> Any:
@@ -185,6 +186,7 @@ class TrueSimulator(ABC, Generic[W]):
             self.close_world(left[0])
 
     def _begun(self, b: int) -> tuple[W, Robot]:
+        [b] = chosen_episodes([b], len(self))
         world = self._worlds[b]
         require(world is not None, f"episode {b} has not begun; reset it first")
         return world

@@ -68,6 +68,8 @@ def test_what_is_refused_changes_no_episode():
     unknown = type(start)(start.robot, start.images, start.actions)  # no seed
     sim.reset(start)
     now = sim.step([np.array([0.9, 0.0]), None])
+    waiting = SuiteSimulator([PUSHER], episodes=2)
+    waiting.reset(start, episodes=[0])
     for episodes in ([2], [-1], [0, 0]):
         for refused in (
             lambda which=episodes: sim.reset(start, episodes=which),
@@ -75,6 +77,10 @@ def test_what_is_refused_changes_no_episode():
         ):
             with pytest.raises(ConfigError, match="episodes must be different numbers below 2"):
                 refused()
+    for b, reason in ((-1, "numbers below 2"), (5, "numbers below 2"), (0.5, "whole numbers"), (1, "has not begun")):
+        for asked in (waiting.max_rewind, waiting.state):
+            with pytest.raises(ConfigError, match=reason):
+                asked(b)
     with pytest.raises(ConfigError, match=r"frames must be whole numbers, got \[0.5\]"):
         sim.rewind(0.5)
     with pytest.raises(ConfigError, match=r"episodes must be whole numbers, got \[1.5\]"):
