@@ -57,13 +57,11 @@ class LeRobotSettings:
 
 
 @dataclass(frozen=True)
-class EpicKitchensSettings:
-    """Which frames make episodes."""
+class HumanSettings:
+    """Which frames of human videos make episodes."""
 
-    min_score: float = 0.5
-    """Lowest score of a detection that is used; the authors of the detections recommend 0.5."""
-    min_frames: int = 61
-    """Shortest run of frames with both hands that makes an episode: 61 at 10 Hz are 6 s."""
+    min_frames: int
+    """Shortest run of frames that makes an episode."""
     short_side: int | None = HUMAN_SHORT_SIDE
     """Shrink frames to this shorter side."""
 
@@ -74,37 +72,36 @@ class EpicKitchensSettings:
 
 
 @dataclass(frozen=True)
-class Ego4dSettings:
+class EpicKitchensSettings(HumanSettings):
     """Which frames make episodes."""
 
-    max_gap: float = 1.0
-    """Longest pause between annotated frames of one episode, in seconds."""
+    min_frames: int = 61
+    """Shortest run of frames with both hands that makes an episode: 61 at 10 Hz are 6 s."""
+    min_score: float = 0.5
+    """Lowest score of a detection that is used; the authors of the detections recommend 0.5."""
+
+
+@dataclass(frozen=True)
+class Ego4dSettings(HumanSettings):
+    """Which frames make episodes."""
+
     min_frames: int = 16
     """Shortest episode, in frames at 2 Hz."""
-    short_side: int | None = HUMAN_SHORT_SIDE
-    """Shrink frames to this shorter side."""
+    max_gap: float = 1.0
+    """Longest pause between annotated frames of one episode, in seconds."""
 
     def check(self) -> None:
-        """Raises ConfigError for invalid settings."""
-        _check_side(self.short_side)
-        require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")
+        super().check()
         require(self.max_gap > 0, f"max_gap must be positive, got {self.max_gap}")
 
 
 @dataclass(frozen=True)
-class EgoExo4dSettings:
+class EgoExo4dSettings(HumanSettings):
     """Which takes and frames make episodes."""
 
+    min_frames: int = 300
+    """Shortest run of labelled frames that makes an episode: 300 at 30 Hz are 10 s."""
     camera: str = "cam01"
     """Name of the fixed camera."""
     split: str = "train"
     """Split of the annotations: train, val or test."""
-    min_frames: int = 300
-    """Shortest run of labelled frames that makes an episode: 300 at 30 Hz are 10 s."""
-    short_side: int | None = HUMAN_SHORT_SIDE
-    """Shrink frames to this shorter side."""
-
-    def check(self) -> None:
-        """Raises ConfigError for invalid settings."""
-        _check_side(self.short_side)
-        require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")
