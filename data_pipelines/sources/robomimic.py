@@ -35,6 +35,7 @@ from data_pipelines.sources.video import shrink
 from hma_jax.config import ConfigError
 
 CONTROL_RATE = 20.0
+SIM_STATE = "observation/sim_state"
 SUCCESS_REWARD = 1.0
 """robosuite's reward of a solved task, sparse or shaped; shaping alone stays below it."""
 
@@ -61,9 +62,10 @@ class RobomimicSource:
             self.task, self.recorded_hz = _environment(self.path, file)
             self.masks = _demonstrations(self.path, file, settings.filter_key)  # the mask of each demonstration
             self.units = list(self.masks)
-            self.layout, self.cameras, self.ending, self.unsupported_images = self._read_layout(
-                file["data"][self.units[0]], settings.camera
-            )
+            demo = file["data"][self.units[0]]
+            self.layout, self.cameras, self.ending, self.unsupported_images = self._read_layout(demo, settings.camera)
+            observed = [key for key in self.layout.vectors if key != "action"]
+            self.integers = [key for key in observed if demo[hdf5_path(key)].dtype.kind != "f"]  # and flags
         self.hz = float(settings.hz or self.recorded_hz or CONTROL_RATE)
         self.description = f"Robomimic demonstrations of {self.task} ({self.path.name}), {self.hz:g} Hz."
 
@@ -76,6 +78,8 @@ class RobomimicSource:
             "cameras": list(self.cameras),
             "hz": self.hz,
             "short_side": self.short_side,
+            # Earlier versions' conversions lack these, so their identity is different.
+            **({"integers": self.integers} if self.integers else {}),
         }
 
     @functools.cached_property
@@ -137,29 +141,32 @@ class RobomimicSource:
         names, and depth images)."""
         where = f"{self.path}: {demo.name.lstrip('/')}"
         obs = {k: v for k, v in demo.get("obs", {}).items() if hasattr(v, "dtype")}  # robomimic writes no groups here
-        ending = "_image" if any(k.endswith("_image") for k in obs) else ""
-        available = sorted(k.removesuffix(ending) for k in obs if k.endswith("_image"))
-        if not ending:  # as in LIBERO's files, agentview_rgb
-            available = sorted(k for k in obs if holds_images(obs[k]))
+        pictures = [k for k, array in obs.items() if holds_images(array)]
+        ending = "_image" if any(k.endswith("_image") for k in pictures) else ""  # none in LIBERO's: agentview_rgb
+        available = sorted(k.removesuffix(ending) for k in pictures if k.endswith(ending))
         if not available:
             raise DataError(
-                f"{where}/obs has no *_image nor other uint8 images (it holds {', '.join(sorted(obs)) or 'nothing'}): it is a "
-                "low-dimensional or raw file. Download the image file of the task, or render images from its states "
-                "with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
+                f"{where}/obs has no *_image nor other uint8 images [N, H, W, 3] (it holds {', '.join(sorted(obs)) or 'nothing'}): "
+                "it is a low-dimensional or raw file. Download the image file of the task, or render images from its "
+                "states with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
             )
         cameras = choose(wanted, available, "camera", where)
         if "actions" not in demo:
             raise DataError(f"{where} has no 'actions'; this is not a robomimic file.")
         vectors = {"action": int(np.prod(demo["actions"].shape[1:]))}
         for key in sorted(obs):
-            if np.dtype(obs[key].dtype).kind == "f" and obs[key].ndim <= 2:
+            if np.dtype(obs[key].dtype).kind in "fiub" and obs[key].ndim <= 2:
                 vectors[f"observation/{key}"] = int(np.prod(obs[key].shape[1:]))
         states = demo.get("states")  # a group in other programs' files
         if getattr(states, "ndim", 0) == 2 and states.shape[1]:
-            vectors["observation/sim_state"] = int(states.shape[1])
+            if SIM_STATE in vectors:
+                raise _same_name(where, "states", "obs/sim_state", SIM_STATE)
+            vectors[SIM_STATE] = int(states.shape[1])
         images = {f"observation/{c}": image_field(None, None) for c in cameras}
-        pictures = {camera + ending for camera in available}
-        others = sorted(key for key in obs if obs[key].ndim >= 3 and key not in pictures)
+        if both := sorted(images.keys() & vectors.keys()):
+            raise _same_name(where, hdf5_path(both[0]) + ending, hdf5_path(both[0]), both[0])
+        used = {camera + ending for camera in available}
+        others = sorted(key for key in obs if obs[key].ndim >= 3 and key not in used)
         unsupported_images = {f"observation/{key}": tuple(map(int, obs[key].shape[1:])) for key in others}
         return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras, ending, unsupported_images
 
@@ -246,7 +253,15 @@ def succeeded(rewards: np.ndarray | None, dones: np.ndarray | None) -> bool | No
 
 
 def hdf5_path(key: str) -> str:
-    return "states" if key == "observation/sim_state" else f"obs/{key.removeprefix('observation/')}"
+    return "states" if key == SIM_STATE else f"obs/{key.removeprefix('observation/')}"
+
+
+def _same_name(where: str, one: str, other: str, name: str) -> DataError:
+    """The error for two fields of which one would hide the other."""
+    return DataError(
+        f"{where}: {quote(one)} and {quote(other)} would both be called {name!r}. Rename one of them in a copy of the "
+        "file (h5py: move(OLD, NEW)), in every demonstration."
+    )
 
 
 def _env_args(path: Path, text: Any) -> dict[str, Any]:

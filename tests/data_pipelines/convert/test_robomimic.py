@@ -84,6 +84,47 @@ def test_without_an_image_of_that_name_every_picture_is_a_camera(tmp_path):
     assert [number(image) for image in episode.images] == [24 + t for t in range(7)]
 
 
+@pytest.mark.parametrize(
+    "field, message",
+    [
+        ("agentview", "'obs/agentview_image' and 'obs/agentview' would both be called 'observation/agentview'"),
+        ("sim_state", "'states' and 'obs/sim_state' would both be called 'observation/sim_state'"),
+    ],
+)
+def test_no_field_hides_another_of_the_same_name(tmp_path, field, message):
+    def change(file):
+        for demo in file["data"].values():
+            demo[f"obs/{field}"] = np.zeros((len(demo["actions"]), 2), np.float32)
+
+    path = write_robomimic(tmp_path / "image.hdf5", change=change)
+    with pytest.raises(DataError, match=f"demo_9: {message}. Rename one of them"):
+        RobomimicSource(path)
+
+
+def test_integers_and_flags_are_vectors_too(tmp_path):
+    def change(file):
+        for demo in file["data"].values():
+            demo["obs/gripper"] = np.arange(len(demo["actions"]))[:, None]
+            demo["obs/contact"] = np.ones(len(demo["actions"]), bool)
+
+    source = RobomimicSource(write_robomimic(tmp_path / "image.hdf5", change=change))
+    assert source.identity() != RobomimicSource(write_robomimic(tmp_path / "otherimage.hdf5")).identity()
+    dataset, _ = read_back(convert(source, tmp_path, "lift").directory, "observation/agentview")
+    record = dataset.record(0)
+    assert record["steps/observation/gripper"].tolist() == [0, 1, 2, 3, 4]
+    assert record["steps/observation/contact"].tolist() == [1] * 5
+
+
+def test_a_depth_image_beside_the_cameras_is_named_and_left_out(tmp_path):
+    def change(file):
+        for demo in file["data"].values():
+            demo["obs/agentview_depth_image"] = np.zeros((len(demo["actions"]), 32, 32, 1), np.uint16)
+
+    source = RobomimicSource(write_robomimic(tmp_path / "image.hdf5", change=change))
+    assert list(source.cameras) == ["agentview", "robot0_eye_in_hand"]
+    assert source.unsupported_images == {"observation/agentview_depth_image": (32, 32, 1)}
+
+
 def test_groups_beside_the_arrays_of_a_demonstration_are_left_out(tmp_path):
     """As Isaac Lab writes them."""
 
