@@ -92,7 +92,9 @@ class Measurements:
 
         Seeds are drawn per run, so that branches of a run move together. A seed's deviation from the mean of its
         position is multiplied by sqrt(m / (m - 1)) for m seeds, and by `_stretch` if levels were removed: otherwise the
-        spread of few seeds would be too small. With a single seed the spread is unknown, and the loss stays as it is.
+        spread of few seeds would be too small. Deviations are those of the logarithm, as in `noise`: beside a failed
+        seed, those of the loss itself would take the others below zero. With a single seed the spread is unknown, and
+        the loss stays as it is.
         """
         number = int(rng.integers(2**31))
         if self.panel is None:
@@ -112,10 +114,10 @@ class Measurements:
                     continue
                 # If some seeds of the run are missing, the existing ones are drawn on their own.
                 chosen = chosen_RS if m == len(seeds) else rng.integers(0, m, (draws, m))
-                own = means_Rn[:, at]
-                centre = own.mean(1, keepdims=True)
+                logs = np.log(means_Rn[:, at])
+                centre = logs.mean(1, keepdims=True)
                 times = self._stretch() * np.sqrt(m / (m - 1))
-                found[:, at] = centre + times * (np.take_along_axis(own, chosen, 1) - centre)
+                found[:, at] = np.exp(centre + times * (np.take_along_axis(logs, chosen, 1) - centre))
         return found
 
 

@@ -8,7 +8,7 @@ import scipy.stats
 
 from experiments.analysis.isoflop import _Line, _misfit, fit_isoflop
 from experiments.report.fits import describe_fits, fit_rows
-from tests.experiments.analysis.curves import measured, of_one_run, only, power
+from tests.experiments.analysis.curves import measured, of_one_run, only, power, scaled
 
 SIZES, BUDGETS = np.geomspace(1e4, 1e7, 7), np.geomspace(6e10, 6e12, 5)
 FIVE, FOUR = np.geomspace(1e4, 1e6, 5), np.geomspace(1e12, 1e13, 4)
@@ -28,6 +28,12 @@ def test_the_exponent_and_its_interval():
     for budget in fit.budgets:
         assert budget.best.value == pytest.approx((budget.flops / 6) ** 0.5, rel=0.15)
         assert budget.best.low < budget.best.value < budget.best.high
+
+
+def test_one_run_that_went_wrong_leaves_the_other_seeds_their_losses():
+    """Its draws pull the others away from it, but never to a loss below zero, which has no logarithm."""
+    fit = fit_isoflop(scaled(runs(np.random.default_rng(0)), {0: 20.0}), np.geomspace(7e10, 5e12, 4), draws=50)
+    assert all(np.isfinite([c.value, c.low, c.high]).all() for c in (fit.exponent, *(b.best for b in fit.budgets)))
 
 
 def test_budgets_between_branches_are_interpolated():
