@@ -54,6 +54,16 @@ def said(mean: float, low: float, high: float) -> str:
     return f"{mean:.2f} ({low:.2f} to {high:.2f})"
 
 
+NIGHT = {
+    "synthetic_night": FIRST,
+    "synthetic_night_two": FIRST,
+    "synthetic_night_through": FIRST,
+    "grown_night": DRIVEN,
+    "grown_night_two": DRIVEN,
+    "grown_night_through": DRIVEN,
+}
+
+
 def page() -> str:
     """In one line."""
     return " ".join((ROOT / "docs" / "generating.md").read_text().split())
@@ -76,13 +86,12 @@ def test_what_following_actions_is_worth_is_as_the_page_says(name):
 
 def test_what_generated_frames_add_to_the_recorded_ones_is_as_the_page_says():
     assert f"The generated frames are worth {worth('synthetic_given', GIVEN)} of success" in page()
-    one, two, served = (
-        worth(name, GIVEN) for name in ("synthetic_night", "synthetic_night_two", "grown_night_through")
-    )
+    one, two, through, served, served_two, served_through = (worth(name, GIVEN) for name in NIGHT)
     assert f"worth {one} of success after one recorded frame and {two} after two" in page()
+    assert f"{served} after one and {served_two} after two" in page()
+    assert f"Through the tokenizer, after one, it is {through} and {served_through}." in page()
     assert (
-        f"{served} after one and {worth('grown_night_two', GIVEN)} after two" in page()
-        and f"so generated frames are worth {served} of success" in page()
+        f"so generated frames are worth {served} of success. The first, smaller model's are worth {one} there" in page()
     )
     assert f"in action error they do: {worth('synthetic_night_two', GIVEN, 'error')}" in page()
 
@@ -120,19 +129,30 @@ def test_what_the_served_model_s_trajectories_are_worth_is_as_the_page_says():
     assert ", ".join(said(r.mean, r.low, r.high) for r in (one.measured["error"] for one in closed)) in page()
 
 
-NIGHT = {
-    "synthetic_night": FIRST,
-    "synthetic_night_two": FIRST,
-    "synthetic_night_through": FIRST,
-    "grown_night_through": DRIVEN,
-    "grown_night_two": DRIVEN,
-}
-
-
 @pytest.mark.parametrize("what", ["success", "error"])
 def test_what_trajectories_are_worth_that_outlast_their_recorded_frames_is_as_the_page_says(what):
     ways = [summary_of(name, model) for name, model in NIGHT.items()]
     assert side_by_side(ways, what) in (ROOT / "docs" / "generating.md").read_text()
+
+
+def test_models_are_compared_under_one_protocol():
+    """What is said in short held the served model's policies, which see all frames through the tokenizer, against those
+    of the first model, which do not."""
+    first, served = (
+        json.loads((RESULTS / name / "settings.json").read_text()) for name in ("synthetic_night", "grown_night")
+    )
+    assert first.pop("simulator")["decode"] == served["simulator"]["decode"]
+    assert {name for name, x in first.items() if served[name] != x} == {"run", "weights"}
+    shares = {
+        one.name.removeprefix("share of the gap: "): one.measured["success"]
+        for one in summary_of("grown_night", DRIVEN)
+        if one.name.startswith("share")
+    }
+    ours, given = (
+        said(r.mean, r.low, r.high) for r in (shares["10 + 90 generated"], shares["recorded first frames only"])
+    )
+    assert f"after one recorded frame close {ours} of the gap" in page()
+    assert f"The ninety recorded frames alone close {given}, so" in page()
 
 
 @pytest.mark.parametrize(
