@@ -32,6 +32,8 @@ OF_SOME = {
         "model.action_alignment": "causal",
         "train.masking.action_leak": "all",
     },
+    "a robot without actions has none that leak into blocks": {"train.masking.action_leak": "conditioning"},
+    "a robot without actions has none that leak": {"train.masking.action_leak": "all"},
     "what rounding leaves is no scale of actions": {"train.action_scale": "quantiles"},
     "frames of what predicts none are not judged: a policy": {"train.masking.setting": "policy"},
     "frames of what predicts none are not judged: inverse dynamics": {"train.masking.setting": "inverse"},

@@ -106,6 +106,11 @@ class MaskingConfig:
             "frames; leave it at 1",
         )
         require(
+            self.action_leak == "none" or not self.ignores_actions,
+            f"masking.action_leak {self.action_leak!r} shows the actions that setting {self.setting!r} hides, but a "
+            "model trained for it is used without actions; set masking.setting=forward, or masking.action_leak=none",
+        )
+        require(
             not (self.teacher_forcing and self.predicts_actions),
             f"masking.teacher_forcing works only with settings that predict no actions, but {self.setting!r} predicts "
             "actions",

@@ -112,7 +112,7 @@ class HMA(nnx.Module):
             feature = self.stem(self.normalise(actions_BTU, embodiment_B).astype(self.dtype), robot_row_B)
             from_tokens = from_blocks = action_hidden_BT
             if leak != "none":
-                from_blocks = self._hidden_through_leaks(action_hidden_BT, positions)
+                from_blocks = self._hidden_through_leaks(action_hidden_BT, embodiment_B, positions)
             if leak == "all":
                 from_tokens = from_blocks
             action = ActionFeature(feature, None if from_blocks is None else ~from_blocks)
@@ -135,12 +135,19 @@ class HMA(nnx.Module):
         x = jnp.where(unknown_BTS[..., None], 0, self.embed(frames, None, self.dtype))
         return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
 
-    def _hidden_through_leaks(self, action_hidden_BT: jax.Array | None, positions: jax.Array) -> jax.Array | None:
-        """bool [B, T]: the frames whose action is hidden despite the leak; None: there are none. With `causal`
-        alignment it is the first frame, to which no action led (`align_hidden`)."""
-        if action_hidden_BT is None or self.config.action_alignment == "released":
+    def _hidden_through_leaks(
+        self, action_hidden_BT: jax.Array | None, embodiment_B: jax.Array, positions: jax.Array
+    ) -> jax.Array | None:
+        """bool [B, T]: the frames whose action is hidden despite the leak; None: there are none. They are those of
+        robots without recorded actions, and with `causal` alignment the first, to which no action led
+        (`align_hidden`)."""
+        causal = self.config.action_alignment == "causal"
+        if action_hidden_BT is None or (all(self.table.chunks) and not causal):
             return None
-        return action_hidden_BT & (positions == 0)
+        nothing_BT = jnp.asarray(self.table.chunks == 0)[embodiment_B][:, None]
+        if causal:
+            nothing_BT = nothing_BT | (positions == 0)
+        return action_hidden_BT & nothing_BT
 
     def _action_tokens(
         self, feature_BTD: jax.Array, action_hidden_BT: jax.Array | None, positions: jax.Array

@@ -62,6 +62,7 @@ def make_train_step(
     trained_E = np.array([name in (config.only or table.names) for name in table.names])
     check_step(table, trained_E, model, config, accumulate)
     masking, specs = config.masking, declared.specs
+    leaking_E = find_leaking(table, model, masking.action_leak)
     trained = OwnOnly(specs, trained_E) if config.only else Everything(specs, trained_E)
     schedule = make_schedule(config.optimizer, config.steps)
     multipliers = jax.tree.map(lambda spec: learning_rate_multiplier(spec, model), trained.specs, is_leaf=is_spec)
@@ -81,9 +82,7 @@ def make_train_step(
         grads, total = gradient(own, rows, counts)
         grads, norm = clip_by_global_norm(trained.mask(grads, active), config.optimizer.clip_norm)
         rate = schedule(state.step)
-        presence = find_presence(
-            masked, batch["embodiment"], trained_E, model, trained.shared, real_BT, masking.action_leak
-        )
+        presence = find_presence(masked, batch["embodiment"], trained_E, model, trained.shared, real_BT, leaking_E)
         here = presence._replace(robots={use: x[active.robots_G] for use, x in presence.robots.items()})
         places_G = trained.moment_places(active)
         new, adam = apply_update(
@@ -170,7 +169,7 @@ def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
 
 def check_own(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
     """Raises ConfigError if no per-robot parameter of these robots would ever be updated."""
-    shown = not masking.ignores_actions or masking.action_leak != "none"
+    shown = not masking.ignores_actions
     require(
         shown and any(robot.chunk for robot in robots),
         f"train.only: {', '.join(robot.name for robot in robots)} would have no parameters to train: a robot's own "
@@ -180,6 +179,13 @@ def check_own(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
     )
 
 
+def find_leaking(table: EmbodimentTable, model: ModelConfig, leak: ActionLeak) -> np.ndarray:
+    """bool [E]: the robots whose hidden actions the model is shown through a `leak`."""
+    # Blocks without conditioning have nothing to leak into.
+    leaks = leak == "all" or (leak == "conditioning" and model.block_conditioning is not None)
+    return leaks & (table.chunks > 0)
+
+
 def find_presence(
     masked: Masked,
     embodiment_B: jax.Array,
@@ -187,18 +193,19 @@ def find_presence(
     model: ModelConfig,
     everything: bool = True,
     real_BT: jax.Array | None = None,
-    leak: ActionLeak = "none",
+    leaking_E: np.ndarray | None = None,
 ) -> Presence:
     """The parameters that a batch updates. Per-robot parameters are updated only for the robots of `trained_E`, shared
-    ones only if `everything` is trained. Padding frames (not `real_BT`) do not count. Hidden actions that a `leak`
-    shows count as shown."""
+    ones only if `everything` is trained. Padding frames (not `real_BT`) do not count. Hidden actions of `leaking_E`
+    (`find_leaking`; None: of no robot) count as shown."""
     action_hidden_BT = masked.action_hidden_T
-    # Blocks without conditioning have nothing to leak into.
-    leaks = leak == "all" or (leak == "conditioning" and model.block_conditioning is not None)
+    shown_BT = ~action_hidden_BT
+    if leaking_E is not None and leaking_E.any():
+        shown_BT = shown_BT | jnp.asarray(leaking_E)[embodiment_B][:, None]
     real_BT = jnp.ones_like(action_hidden_BT) if real_BT is None else real_BT
     rows: dict[Use, jax.Array] = {
         "always": jnp.ones(len(embodiment_B), bool),
-        "actions_shown": ((~action_hidden_BT | leaks) & real_BT).any(axis=1),
+        "actions_shown": (shown_BT & real_BT).any(axis=1),
         # With causal alignment the first frame is never shown an action.
         "actions_hidden": (action_hidden_BT & real_BT).any(axis=1) | (model.action_alignment == "causal"),
         "actions_predicted": masked.action_targets_T.any(axis=1),

@@ -10,12 +10,13 @@ import pytest
 from flax import nnx
 
 from hma_jax.config import ConfigError, MaskingConfig, MaskingSetting
+from hma_jax.config.training import ActionLeak
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import LossSums, count_targets, masked_loss
 from hma_jax.objective.masking import hidden_at_inference, mask_tokens
 from hma_jax.training.state import init_state, state_shapes
-from hma_jax.training.step import find_presence, make_train_step
+from hma_jax.training.step import find_leaking, find_presence, make_train_step
 from tests.tiny import (
     DIFFUSION,
     SMALLER,
@@ -287,9 +288,36 @@ def test_hidden_actions_do_not_reach_the_frames_on_any_path(conditioning: str, a
     config = shallow_config(conditioning=conditioning, action_alignment=alignment)
     passive = MaskingConfig(setting="passive")
     np.testing.assert_array_equal(losses(config, passive), losses(config, passive, poison_hidden))
-    leaky = dataclasses.replace(passive, action_leak="conditioning")
-    if conditioning != "concat":
+    leaky = MaskingConfig(setting="full", action_leak="conditioning")
+    if conditioning == "concat+modulate":
         assert losses(config, leaky)[0] != losses(config, leaky, poison_hidden)[0]
+
+
+@pytest.mark.parametrize("alignment", ["released", "causal"])
+@pytest.mark.parametrize("conditioning, leak", [("concat+modulate", "conditioning"), ("cross_attention", "all")])
+def test_a_robot_without_actions_is_shown_none_through_a_leak_as_at_inference(conditioning, leak, alignment):
+    config = shallow_config(conditioning=conditioning, action_alignment=alignment)
+    declared, params = lively_params(config, MIXED)
+    data, masked = masked_batch(config, MaskingConfig(action_leak=leak), MIXED, batch=8)
+    tokens, actions, robots = (jnp.asarray(data[name]) for name in ("tokens", "actions", "embodiment"))
+    assert set(robots.tolist()) == {0, 1, 2}
+    inference = hidden_at_inference(MIXED, "forward", robots, config.frames)
+
+    @partial(jax.jit, static_argnames="leak")
+    def predicted(hidden: jax.Array, leak: ActionLeak) -> jax.Array:
+        hma = declared.merge(params)
+        hidden = hma.align_hidden(hidden, hidden.shape)
+        shown = hma.align(actions), robots
+        return hma(tokens, jnp.ones_like(masked.masked), *shown, action_hidden_BT=hidden, leak=leak).token_outputs
+
+    np.testing.assert_array_equal(predicted(masked.action_hidden_T, leak), predicted(inference, "none"))
+    presence = find_presence(masked, robots, np.ones(3, bool), config, leaking_E=find_leaking(MIXED, config, leak))
+    assert presence.robots["actions_shown"].tolist() == [True, False, True]
+
+
+def test_a_leak_of_actions_to_a_model_that_is_used_without_any_is_refused():
+    with pytest.raises(ConfigError, match="action_leak 'all' shows the actions that setting 'passive' hides"):
+        MaskingConfig(setting="passive", action_leak="all")
 
 
 def test_hidden_actions_are_predicted_without_being_seen():
@@ -377,7 +405,8 @@ def test_stems_and_modulation_learn_from_hidden_actions_that_leak(conditioning: 
     """But not from what would lead to the first frame, which nothing does."""
     config = shallow_config(conditioning=conditioning, action_alignment=alignment)
     data, masked = masked_batch(config, MaskingConfig(setting="passive"), batch=8)
-    presence = find_presence(masked, data["embodiment"], np.ones(TABLE.size, bool), config, leak=leak)
+    leaking_E = find_leaking(TABLE, config, leak)
+    presence = find_presence(masked, data["embodiment"], np.ones(TABLE.size, bool), config, leaking_E=leaking_E)
     declared, params = lively_params(config)
     hma, actions = declared.merge(params), data["actions"]
     hidden = hma.align_hidden(masked.action_hidden_T, actions.shape[:2])
@@ -393,15 +422,15 @@ def test_stems_and_modulation_learn_from_hidden_actions_that_leak(conditioning: 
 
 
 def test_a_step_updates_what_its_real_frames_and_its_leak_concern(monkeypatch):
-    """Else stems of a model that is passive but for a leak stood still, and what only padding shows moved."""
+    """Else stems stood still that learn from hidden actions alone, and what only padding shows moved."""
     config, seen = model_config(**SMALLER), []
 
-    def find(masked, embodiment_B, trained_E, model, everything=True, real_BT=None, leak="none"):
-        seen.append((real_BT, leak))
-        return find_presence(masked, embodiment_B, trained_E, model, everything, real_BT, leak)
+    def find(masked, embodiment_B, trained_E, model, everything=True, real_BT=None, leaking_E=None):
+        seen.append((real_BT, leaking_E))
+        return find_presence(masked, embodiment_B, trained_E, model, everything, real_BT, leaking_E)
 
     monkeypatch.setattr("hma_jax.training.step.find_presence", find)
-    train = train_config(masking=MaskingConfig(setting="passive", action_leak="all"))
+    train = train_config(masking=MaskingConfig(setting="inverse", action_leak="all"))
     declared, batch = declare_model(config, TABLE), random_batch(0, config)
     step = make_train_step(declared, TABLE, config, train)
     given = batch | {"real": np.ones(batch["tokens"].shape[:2], bool)}
@@ -409,8 +438,8 @@ def test_a_step_updates_what_its_real_frames_and_its_leak_concern(monkeypatch):
 
     def traced(state, given):
         step(state, given)
-        ((real_BT, leak),) = seen
-        assert real_BT is given["real"] and leak == "all"
+        ((real_BT, leaking_E),) = seen
+        assert real_BT is given["real"] and leaking_E.all()
 
     jax.eval_shape(traced, state, given)
 

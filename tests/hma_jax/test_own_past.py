@@ -146,7 +146,7 @@ def test_it_is_drawn_after_hidden_actions_where_these_leak_to_the_model(monkeypa
 
     seen = []
     monkeypatch.setattr(losses, "draw_own_past", lambda model, past, *_, leak, **__: seen.append(leak) or past)
-    masking = replace(OWN, setting="passive", action_leak="all")
+    masking = replace(OWN, action_leak="all")
     masked = mask(jax.random.key(0), tokens, given[1], config, masking, TABLE)
     jax.eval_shape(
         lambda: losses.masked_loss(declared.merge(params), masked, tokens, *given, masking, keys, training=True).tokens
