@@ -286,16 +286,16 @@ def require_results(jobs: Sequence[Job], states: dict[str, State], again: str, a
     if not bad:
         return
     diverged = sum(state.event == DIVERGED for _, state in bad)
-    refused = any(state.event == REFUSED for _, state in bad)
+    refused = [state for _, state in bad if state.event == REFUSED]
     words = [f"{len(bad)} of {len(jobs)} trials have no result:"]
-    words += [f"  {_without_result(job, state, refused)}" for job, state in bad]
+    words += [f"  {_without_result(job, state, bool(refused))}" for job, state in bad]
     if diverged:
         words.append(
             f"{diverged} diverged, which is final: from the same seed they would diverge again. The report shows it"
         )
     if len(bad) > diverged:
         how = "To try the others again" if diverged else "To try them again"
-        if refused and not accept_code:
+        if any("--accept-code" in state.message for state in refused) and not accept_code:  # not for its data
             how, again = f"{how}, if the change of the sources alters no result", f"{again} --accept-code"
         words.append(f"{how}: {again}")
     raise TrialsFailed("\n".join(words), Exit.DIVERGED if len(bad) == diverged else Exit.FAILED)

@@ -26,7 +26,7 @@ LOST, PREEMPTED = "lost", "preempted"
 died), or it was asked to stop and has saved. Both continue from the last checkpoint."""
 
 REFUSED = "refused"
-"""Its sources are not those that the sweep was started with: it did not run, but may run the next time."""
+"""Its sources or data are not those that the sweep was started with: it did not run, but may run the next time."""
 
 MISSING = "missing"
 """The state of a trial without a line: it has not run."""

@@ -45,6 +45,10 @@ class CodeChanged(ConfigError):
     """The sources are not those that a sweep was started with."""
 
 
+class InputsChanged(ConfigError):
+    """The study's tokens, windows or tokenizer are not those that a trial was planned with."""
+
+
 @dataclass(frozen=True)
 class Start:
     """What a process of the trial ran with. A start that is equal to the one before is not recorded again."""

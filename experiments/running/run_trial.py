@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.running.attempts import EVALUATING, RUN
 from experiments.running.machine import describe_machine
-from experiments.running.provenance import read_record, record_end
+from experiments.running.provenance import InputsChanged, Provenance, read_record, record_end
 from experiments.running.result_file import SAMPLES, write_result
 from experiments.running.run_options import UNWATCHED, RunOptions
 from experiments.running.trial import Trial, loader_of
@@ -58,20 +58,43 @@ class PreparedData:
     manifest: EvalManifest
     counterfactual: CounterfactualFrames | None = None  # for robots that are simulated
 
+    def provenance(self) -> Provenance:
+        """What a trial on this data is named by. Datasets that the store lacks are left out of its hash."""
+        names = [one.dataset for one in self.manifest.datasets if one.dataset in self.store.names]
+        return Provenance(self.store.hash(names), self.manifest.hash(), self.tokenizer.identity)
 
-def open_prepared_data(workspace: Workspace) -> PreparedData:
-    """Raises ConfigError or DataError for what is missing or damaged."""
+
+def open_prepared_data(workspace: Workspace, inputs: Provenance | None = None) -> PreparedData:
+    """Raises ConfigError or DataError for what is missing or damaged, InputsChanged if any of it is not what `inputs`
+    says."""
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.counterfactual import CounterfactualFrames
     from data_pipelines.windows.evalset import EvalManifest
     from hma_jax.tokenizers.io import load_tokenizer
 
-    return PreparedData(
+    prepared = PreparedData(
         TokenStore(workspace.store),
         load_tokenizer(workspace.tokenizer),
         EvalManifest.load(workspace.manifest),
         CounterfactualFrames.load(workspace.counterfactual) if workspace.counterfactual.exists() else None,
     )
+    if inputs is not None:
+        _require_inputs(workspace, prepared.provenance(), inputs)
+    return prepared
+
+
+def _require_inputs(workspace: Workspace, found: Provenance, planned: Provenance) -> None:
+    compared = (
+        (workspace.store, found.store, planned.store),
+        (workspace.manifest, found.manifest, planned.manifest),
+        (workspace.tokenizer, found.tokenizer, planned.tokenizer),
+    )
+    lines = [f"{path} is {here}, not {wanted}" for path, here, wanted in compared if here != wanted]
+    if lines:
+        raise InputsChanged(
+            f"the study's data changed since this sweep was started: {'; '.join(lines)}. The trial was not run. Put back "
+            "what was there, or run the study's command again, which checks the data and plans the trials anew"
+        )
 
 
 def train_trial(
@@ -228,6 +251,7 @@ def evaluate_on(
 
 def run_trial(
     trial: Trial,
+    inputs: Provenance,
     workspace: Workspace,
     directory: Path,
     *,
@@ -236,11 +260,12 @@ def run_trial(
     begin: Callable[[PreparedData], Mapping[str, Any]] | None = None,
     progress: Progress = lambda *_: None,
 ) -> dict[str, Any]:
-    """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
+    """Trains and evaluates `trial` on the data that `inputs` names, resuming in `directory` what a killed run left
+    there.
 
     `keep`: steps after which its checkpoint stays, for trials that go on from there. `begin` makes what a trial with a
-    source begins with (`initial_model.InitialModel`). Returns what it writes to result.json. Raises ConfigError,
-    DataError, DivergedError or Interrupted.
+    source begins with (`initial_model.InitialModel`). Returns what it writes to result.json. Raises ConfigError
+    (InputsChanged for other data), DataError, DivergedError or Interrupted.
     """
     import jax
 
@@ -251,7 +276,7 @@ def run_trial(
     from hma_jax.runtime.processes import is_writer
 
     started = time.perf_counter()
-    prepared = open_prepared_data(workspace)
+    prepared = open_prepared_data(workspace, inputs)
     if begin is None:
         beginning = {"table": training_table(prepared.store, loader_of(trial), trial.train.action_scale)}
     else:
@@ -310,11 +335,12 @@ def run_trial(
 
 
 def _evaluated(trial: Trial, prepared: PreparedData, directory: Path, execution: ExecutionConfig) -> list[Any]:
-    """What the numbers of a trial's evaluation depend on: sources, settings, windows and weights."""
+    """What the numbers of a trial's evaluation depend on: sources, settings, data and weights."""
     from hma_jax.training.hashes import read_list
 
     record, weights = read_record(directory), read_list(directory / RUN / CHECKPOINTS / str(trial.train.steps))
-    return [record and record.code, to_dict(trial), to_dict(execution), prepared.manifest.hash(), weights]
+    data = to_dict(prepared.provenance())
+    return [record and record.code, to_dict(trial), to_dict(execution), data, weights]
 
 
 def last_loss(losses: Sequence[float]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The process of one trial: `python -m experiments.running.trial_main DIRECTORY`.
 
 Reads DIRECTORY/job.json, runs the trial, and on failure leaves DIRECTORY/failure.json with
-the state and one message. A trial whose sources are not those that job.json names is refused before any work.
+the state and one message. A trial whose sources or data are not those that job.json names is refused before any work.
 A launcher starts this, on whichever machine; run it by hand to debug a trial.
 """
 
@@ -36,8 +36,8 @@ failing."""
 
 def main(directory: Path) -> int:
     """Runs the trial and returns the exit code. FAILED: see failure.json, also if it diverged; REFUSED: the sources
-    changed; LOST: its files could not be written, its data could not be read, or its accelerator failed; STOPPED or
-    INTERRUPTED: the next attempt continues from here, or another one is running."""
+    or the data changed; LOST: its files could not be written, its data could not be read, or its accelerator failed;
+    STOPPED or INTERRUPTED: the next attempt continues from here, or another one is running."""
     enter_child()  # before anything imports JAX
     try:
         before = _read_failure(directory)
@@ -74,7 +74,7 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from data_pipelines.errors import DataError, UnreachableError
     from experiments.running.initial_model import initial_from_trial
     from experiments.running.job import read_job
-    from experiments.running.provenance import inputs_of, record_start
+    from experiments.running.provenance import InputsChanged, inputs_of, record_start
     from experiments.running.run_trial import run_trial
     from experiments.running.shared_runs import begin_shared
     from experiments.running.trial import trial_id
@@ -95,13 +95,18 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
                 source = directory.parent / trial_id(trial.source, inputs) / RUN
                 begin = partial(initial_from_trial, trial, source)
             workspace = Workspace(directory.parent.parent)
-            run_trial(trial, workspace, directory, execution=execution, keep=shared.keep, begin=begin, progress=report)
+            run_trial(
+                trial, inputs, workspace, directory, execution=execution, keep=shared.keep, begin=begin, progress=report
+            )
         return Exit.DONE
     except Interrupted as request:
         return request.exit
     except TakenOver as error:
         print(error, file=sys.stderr)
         return Exit.STOPPED
+    except InputsChanged as error:
+        write_file(directory / FAILURE, json.dumps({"state": REFUSED, "message": str(error)}))
+        return Exit.REFUSED
     except Exception as error:  # the boundary of the process: every failure becomes a record
         _print_traceback()
         known = isinstance(error, (ConfigError, DataError, DivergedError))

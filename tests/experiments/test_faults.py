@@ -19,9 +19,12 @@ from data_pipelines.errors import UnreachableError
 from data_pipelines.tokens import part_maker
 from experiments.analysis.tables import read_side
 from experiments.cli.main import main
+from experiments.run_study import require_results
 from experiments.running import run_trial as trials
 from experiments.running import trial_main
 from experiments.running.attempts import AttemptEnd, State, outcome
+from experiments.running.provenance import InputsChanged
+from experiments.running.runner import Job, TrialsFailed
 from experiments.running.shared_runs import SharedTraining
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
@@ -135,6 +138,21 @@ def write_job(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "experiments.running.job.read_job", lambda record: (SimpleNamespace(source=None), None, SharedTraining())
     )
+
+
+def test_a_trial_whose_data_is_not_what_it_was_planned_with_is_refused(tmp_path, monkeypatch):
+    """It was filed under the name of the other data."""
+
+    def other(*_, **__):
+        raise InputsChanged("tokenizer is a, not c")
+
+    write_job(tmp_path, monkeypatch)
+    monkeypatch.setattr(trials, "run_trial", other)
+    assert trial_main.main(tmp_path) == Exit.REFUSED
+    state = outcome(tmp_path, AttemptEnd(Exit.REFUSED))
+    assert state == State("refused", "tokenizer is a, not c")
+    with pytest.raises(TrialsFailed, match="To try them again: hma study$"):  # without --accept-code
+        require_results([Job("a", "trial", {})], {"a": state}, "hma study", False)
 
 
 # --- A full disk -----------------------------------------------------------------------------

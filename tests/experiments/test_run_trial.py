@@ -21,7 +21,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.training.loop import FitResult
 from hma_jax.training.state import init_state
-from tests.experiments.fakes import STUDY
+from tests.experiments.fakes import PROVENANCE, STUDY
 from tests.tiny import TABLE, model_config, train_config
 
 MODEL = model_config(width=8, heads=2)
@@ -59,14 +59,15 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
     train_passive = train_config(masking=MaskingConfig(setting="passive"))
     trial = trials.Trial(TABLE.names, None, TABLE.names, MODEL, train_passive, STUDY.eval, measure_untrained=True)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(trials, "open_prepared_data", lambda workspace: SimpleNamespace(store=None))
+        monkeypatch.setattr(trials, "open_prepared_data", lambda *_: SimpleNamespace(store=None))
         drawn = SimpleNamespace(drawn=lambda: {"arm": Drawn(3, 12, 1.0)})
         monkeypatch.setattr("data_pipelines.loading.selection.select_windows", lambda *_: drawn)
         monkeypatch.setattr(trials, "train_trial", train)
         monkeypatch.setattr(trials, "evaluate_on", evaluate)
         monkeypatch.setattr(trials, "write_evaluation", lambda *_: None)
         directory = tmp_path_factory.mktemp("trial")
-        found.result = trials.run_trial(trial, SimpleNamespace(), directory, begin=lambda prepared: {"table": TABLE})
+        begin = lambda prepared: {"table": TABLE}
+        found.result = trials.run_trial(trial, PROVENANCE, SimpleNamespace(), directory, begin=begin)
     return found
 
 
@@ -119,9 +120,9 @@ def test_actions_are_on_the_scale_that_a_trial_asks_for(tmp_path: Path, monkeypa
 
     monkeypatch.setattr("data_pipelines.loading.selection.training_table", table)
     monkeypatch.setattr("data_pipelines.loading.selection.training_embodiment", embodiment)
-    monkeypatch.setattr(trials, "open_prepared_data", lambda workspace: prepared)
+    monkeypatch.setattr(trials, "open_prepared_data", lambda *_: prepared)
     for ask in (
-        lambda: trials.run_trial(CHOSEN, SimpleNamespace(), tmp_path),
+        lambda: trials.run_trial(CHOSEN, PROVENANCE, SimpleNamespace(), tmp_path),
         lambda: trials.train_trial(CHOSEN, prepared, tmp_path),
         lambda: add_robots(SimpleNamespace(table=EmbodimentTable(TABLE.entries[:1])), CHOSEN, prepared),
     ):

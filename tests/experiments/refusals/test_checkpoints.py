@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import pytest
 
 from data_pipelines.windows.evalset import EvalManifest
 from experiments.cli.main import main
+from experiments.running.provenance import InputsChanged
+from experiments.running.run_trial import open_prepared_data, run_trial
 from experiments.running.workspace import Workspace
 from hma_jax.config import require
 from hma_jax.convert import read_official, write_run
@@ -56,6 +59,21 @@ def test_run_of_another_kind(study, tmp_path, refused):
     assert "another kind of run" in message and "use a new output directory" in message
     message = refused(2, "evaluate", out / "tokenizer", *SMOKE, "--out", out, *data)
     assert f"{out / 'tokenizer'}: not a run of this project (no model, table)" in message
+
+
+@pytest.mark.parametrize("changed", ["store", "manifest", "tokenizer"])
+def test_a_trial_does_not_run_on_other_data_than_it_was_planned_with(changed, study, tmp_path):
+    """As with a tokenizer of the same shape that took the place of the study's during a sweep."""
+    workspace = Workspace(study[0])
+    inputs = open_prepared_data(workspace).provenance()
+    assert open_prepared_data(workspace, inputs).provenance() == inputs
+    planned, trial = replace(inputs, **{changed: "0ther"}), None
+    with pytest.raises(
+        InputsChanged, match=r"data changed since this sweep was started: \S+ is \w+, not 0ther\."
+    ) as error:
+        run_trial(trial, planned, workspace, tmp_path)
+    assert f"{getattr(workspace, changed)} is {getattr(inputs, changed)}" in str(error.value)
+    assert not list(tmp_path.iterdir())
 
 
 def nothing(path: Path) -> None:
