@@ -99,14 +99,17 @@ def check_numbers(
     windows: Mapping[str, WindowTable],
     group: int,
 ) -> Check:
-    """Whether the table as it was found (`written`) agrees with the results of finished trials (`rows`), and these with
-    what follows from their windows. `group` is the evaluation's perplexity_group."""
+    """Whether the tables as they were found (`written`) agree with the results of finished trials (`rows`), and these
+    with what follows from their windows. `group` is the evaluation's perplexity_group.
+
+    A trial of which one of the two tables has no row was not written there yet: a report may end between them.
+    """
     name = "Every number follows from those of single windows."
     known, drawn = {_key(r): r for r in rows}, {(r.sweep, r.trial) for r in rows}
     written = [r for r in written if r.metric and r.trial in results and (r.sweep, r.trial) in drawn]
-    before = {(r.sweep, r.trial) for r in written}
+    before = {(r.sweep, r.trial, r.of_robot) for r in written}
     edited = [r for r in written if not _same_row(r, known.get(_key(r)))]
-    lost = {_key(r) for r in rows if (r.sweep, r.trial) in before} - {_key(r) for r in written}
+    lost = {_key(r) for r in rows if (r.sweep, r.trial, r.of_robot) in before} - {_key(r) for r in written}
     if edited or lost:
         example = _key(edited[0]) if edited else min(lost, key=str)
         where, count = ", ".join(str(part) for part in example if part != ""), len(edited) + len(lost)

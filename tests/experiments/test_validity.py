@@ -1,6 +1,7 @@
 """What makes a study's numbers unbelievable shows at the top of its page."""
 
 import csv
+import errno
 import html
 import json
 import shutil
@@ -9,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.analysis import rows
 from experiments.analysis.preregistered import FILE as PREREGISTERED
 from experiments.analysis.preregistered import ExpectationOutcome, Expected
 from experiments.report import validity
@@ -20,7 +22,7 @@ from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import CONTROL, POINT
 from hma_jax.evaluation.summary import summarise
-from hma_jax.evaluation.windows import FILE, WindowTable
+from hma_jax.evaluation.windows import FILE, WindowTable, read_arrow, write_arrow
 from tests.experiments.conftest import leave_unrendered
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, judged_study
@@ -155,6 +157,28 @@ def test_a_line_taken_out_of_the_table_is_noticed(copied):
     workspace.results.write_text("".join(lines))
     draw(workspace, record)
     assert verdicts(workspace)["numbers"][0] == "bad"
+
+
+@pytest.mark.parametrize("grown", [False, True], ids=["the first", "one of a study that grew"])
+def test_a_report_that_ended_between_its_two_tables_is_not_taken_for_an_edited_one(grown, copied, monkeypatch):
+    """Rows of all robots were lost, it said, of trials that the second table had never had."""
+    workspace, record = copied
+    if grown:
+        table, new = read_arrow(workspace.robots), trials_of(record, width=16)
+        write_arrow(workspace.robots, table.filter([id not in new for id in table["trial"].to_pylist()]))
+    else:
+        workspace.robots.unlink()
+    workspace.results.unlink()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        patch.setattr(rows, "write_arrow", full)
+        draw(workspace, record)
+    assert workspace.results.exists() and workspace.robots.exists() == grown
+    draw(workspace, record)
+    assert verdicts(workspace)["numbers"][0] == "good"
 
 
 @pytest.mark.parametrize("number", ["mean", "sem"])
