@@ -137,10 +137,13 @@ def play(
 
 @contextmanager
 def _listening_at(host: str, port: int) -> Iterator[None]:
-    """If the system does not let the block listen, raises an error that names host and port."""
+    """If the system does not let the block listen, raises an error that names host and port. Errors that name a file,
+    such as a closed or full standard output, are no fault of theirs."""
     try:
         yield
     except OSError as error:
+        if error.filename is not None:
+            raise
         raise ConfigError(
             f"cannot listen on {_place(host, port)}: {error.strerror}; choose another --host or --port"
         ) from error

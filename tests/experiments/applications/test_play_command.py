@@ -1,6 +1,7 @@
 """`hma play`: what it asks for, says and answers signals with."""
 
 import contextlib
+import errno
 import os
 import signal
 import socket
@@ -11,6 +12,7 @@ import pytest
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
 
 from aiohttp.test_utils import TestClient, TestServer
+from rich.console import Console
 
 from experiments.applications.play import server
 from experiments.cli.main import main
@@ -162,6 +164,25 @@ def test_a_place_where_nobody_can_listen_may_be_the_fault_of_either_option(monke
     assert main(["play", str(tmp_path), "--visitors", "1", "--host", "nosuchhost"]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "nosuchhost:" in said and "Name or service not known; choose another --host or --port" in said
+
+
+@pytest.mark.usefixtures("not_warmed_up")
+def test_an_output_that_is_closed_is_no_fault_of_host_or_port(monkeypatch, tmp_path):
+    """The command ended with 2, as for wrong arguments, after which a scheduler does not start it again."""
+    from experiments.applications import simulators
+    from experiments.cli import play as command
+
+    def closed(*_, **__):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    async def serve(app, host, port, ready):
+        monkeypatch.setattr(Console, "print", closed)
+        ready(port)
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(server, "serve", serve)
+    with pytest.raises(BrokenPipeError, match="standard output"):
+        command.play(tmp_path, visitors=1)
 
 
 def test_a_taken_port_is_said_before_anything_is_loaded(monkeypatch, tmp_path, capsys):
