@@ -3,7 +3,8 @@
 Per demonstration of N steps: `actions` [N, A], `obs/<camera>_image` uint8 [N, H, W, 3] before each action (if none has
 that ending, as in LIBERO's files, `obs/<camera>` of that shape), other `obs/*` as vectors, `states` of the simulator,
 `rewards` and `dones` [N]. `mask/<key>` names demonstrations, such as the training ones (`train`, `valid`). The rate is
-the environment's `control_freq`: 20 Hz for every published task.
+the environment's `control_freq`: 20 Hz for every published task. The text is LIBERO's `language_instruction`, or else
+the environment's name.
 DIFFERS: the release uses only states, renders them at 128 pixels, calls the rate 6 Hz, and has a held-out split of one
 task (reference sections 5.4 and 5.5); here episodes keep their images, state and rate, and the held-out ones are drawn
 by hash.
@@ -60,6 +61,7 @@ class RobomimicSource:
         self.path, self.short_side = Path(path), settings.short_side
         with self.open() as file, damage_as(str(path), DataError):
             self.task, self.recorded_hz = _environment(self.path, file)
+            self.text = _instruction(self.path, file) or self.task
             self.masks = _demonstrations(self.path, file, settings.filter_key)  # the mask of each demonstration
             self.units = list(self.masks)
             demo = file["data"][self.units[0]]
@@ -80,6 +82,7 @@ class RobomimicSource:
             "short_side": self.short_side,
             # Earlier versions' conversions lack these, so their identity is different.
             **({"integers": self.integers} if self.integers else {}),
+            **({"text": self.text} if self.text != self.task else {}),
         }
 
     @functools.cached_property
@@ -126,7 +129,7 @@ class RobomimicSource:
             origin=f"{self.path.name}/data/{name}",
             images=images,
             vectors=vectors,
-            instructions=[self.task] * steps,
+            instructions=[self.text] * steps,
             rewards=rewards,
             success=succeeded(rewards, dones),
         )
@@ -189,7 +192,7 @@ def read_totals(path: Path, split: str) -> tuple[int, int | None]:
 def _environment(path: Path, file: Any) -> tuple[str, float | None]:
     if "data" not in file:
         raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
-    args = _env_args(path, file["data"].attrs.get("env_args"))
+    args = _read_attribute(path, file, "env_args")
     return str(args.get("env_name", "robomimic")), _control_rate(path, args)
 
 
@@ -264,15 +267,24 @@ def _same_name(where: str, one: str, other: str, name: str) -> DataError:
     )
 
 
-def _env_args(path: Path, text: Any) -> dict[str, Any]:
+def _instruction(path: Path, file: Any) -> str:
+    """What the demonstrations do, in words, as LIBERO's files say it; "" if the file does not. Their `env_name` is the
+    scene, which many tasks share."""
+    text = _read_attribute(path, file, "problem_info").get("language_instruction")
+    return text.strip('" ') if isinstance(text, str) else ""
+
+
+def _read_attribute(path: Path, file: Any, name: str) -> dict[str, Any]:
+    """The JSON object in an attribute of `data`; empty if there is none."""
+    text = file["data"].attrs.get(name)
     if text is None:
         return {}
     try:
-        args = json.loads(text)
+        values = json.loads(text)
     except (ValueError, TypeError) as error:  # the latter for an attribute that is not text
-        message = f"{path}: the attribute env_args of 'data' is not JSON ({error}). Download the file again."
+        message = f"{path}: the attribute {name} of 'data' is not JSON ({error}). Download the file again."
         raise DataError(message) from error
-    return args if isinstance(args, dict) else {}
+    return values if isinstance(values, dict) else {}
 
 
 def _control_rate(path: Path, args: dict[str, Any]) -> float | None:

@@ -118,7 +118,7 @@ class RobomimicDataset(EpisodeSource):
                 elif key in self.features:
                     found[key] = read_rows(demo, _path(key), where).astype(np.float32).ravel()
                 elif key == INSTRUCTION_KEY:
-                    found[key] = [self._read.task.encode()] * max(int(self._lengths[i]), 0)
+                    found[key] = [self._read.text.encode()] * max(int(self._lengths[i]), 0)
                 elif key == SUCCESS_KEY and (success := self._success(demo, where)) is not None:
                     found[key] = np.array([success], np.int64)
                 elif key == REWARD_KEY and "rewards" in demo:

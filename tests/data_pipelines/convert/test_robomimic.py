@@ -10,6 +10,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.sources.robomimic import RobomimicSource, succeeded
 from data_pipelines.sources.robomimic_dataset import RobomimicDataset
 from data_pipelines.sources.settings import RobomimicSettings
+from data_pipelines.sources.source import INSTRUCTION_KEY
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import demo_actions, number, read_back, write_robomimic
 
@@ -160,6 +161,21 @@ def drop(key):
 
 def env_args(value):
     return lambda file: file["data"].attrs.__setitem__("env_args", value)
+
+
+def test_a_file_of_libero_says_its_task_in_words(tmp_path):
+    """Its env_name is the scene, which many tasks share; the dataset is still called by it."""
+
+    def say(file):
+        file["data"].attrs["problem_info"] = '{"language_instruction": "turn on the stove"}'
+
+    path = write_robomimic(tmp_path / "libero.hdf5", change=say)
+    (episode,) = RobomimicSource(path).read(0)
+    assert episode.instructions == ["turn on the stove"] * 5
+    dataset = RobomimicDataset(path)
+    assert dataset.record(0, [INSTRUCTION_KEY]) == {INSTRUCTION_KEY: [b"turn on the stove"] * 5}
+    assert dataset.name == "robomimic_lift"
+    assert RobomimicSource(path).identity()["text"] == "turn on the stove"
 
 
 @pytest.mark.parametrize("kwargs", ["null", "[]", "{}"])
