@@ -7,8 +7,9 @@ time. A demonstration is named by the file and its number.
 from __future__ import annotations
 
 import hashlib
+import weakref
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -114,9 +115,11 @@ class RobomimicDataset(EpisodeSource):
             demo = file["data"][self._demos[i]]
             for key in keys:
                 if key in self.features and self.features[key].image:
-                    found[key] = _LazyFrames(self, i, key, len(_Frames(demo, _path(key, self._read.ending), where)))
+                    if (path := _path(key, self._read.ending)) in demo:
+                        found[key] = _LazyFrames(self, i, path, len(demo[path]))
                 elif key in self.features:
-                    found[key] = read_rows(demo, _path(key), where).astype(np.float32).ravel()
+                    if _path(key) in demo:
+                        found[key] = read_rows(demo, _path(key), where).astype(np.float32).ravel()
                 elif key == INSTRUCTION_KEY:
                     found[key] = [self._read.text.encode()] * max(int(self._lengths[i]), 0)
                 elif key == SUCCESS_KEY and (success := self._success(demo, where)) is not None:
@@ -126,11 +129,11 @@ class RobomimicDataset(EpisodeSource):
         return found
 
     @contextmanager
-    def _camera(self, i: int, key: str) -> Iterator[_Frames]:
+    def _camera(self, i: int, path: str) -> Iterator[_Frames]:
         where = self._where(i)
         with self._read.open() as file:
             with damage_as(where):
-                frames = _Frames(file["data"][self._demos[i]], _path(key, self._read.ending), where)
+                frames = _Frames(file["data"][self._demos[i]], path, where)
             yield frames
 
     def _length(self, file: Any, i: int) -> int:
@@ -182,21 +185,27 @@ class _Frames(Sequence[SourceFrame]):
 
 
 class _LazyFrames(Sequence[SourceFrame]):
-    """The frames of one camera, each read on access; opens the file every time."""
+    """The frames of one camera, read on access. The file stays open from the first access until this object is
+    garbage-collected, so that neighbouring frames are read together. Not thread-safe."""
 
-    def __init__(self, source: RobomimicDataset, i: int, key: str, length: int):
-        self._source, self._i, self._key, self._length = source, i, key, length
-        self.nbytes = 0
-        """Bytes read for the frames that were asked for."""
+    def __init__(self, source: RobomimicDataset, i: int, path: str, length: int):
+        self._source, self._place, self._length = source, (i, path), length
+        self._frames: _Frames | None = None
+        self._open = ExitStack()
+        weakref.finalize(self, self._open.close)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes read so far."""
+        return self._frames.nbytes if self._frames else 0
 
     def __len__(self) -> int:
         return self._length
 
-    def __getitem__(self, n: int) -> np.ndarray:
-        with self._source._camera(self._i, self._key) as frames:
-            frame = frames[n]
-            self.nbytes += frames.nbytes
-            return frame
+    def __getitem__(self, n: int) -> SourceFrame:
+        if self._frames is None:
+            self._frames = self._open.enter_context(self._source._camera(*self._place))
+        return self._frames[n]
 
 
 def robomimic_name(task: str) -> str:

@@ -102,7 +102,7 @@ def test_frames_that_are_read_one_by_one_count_as_what_is_read(tmp_path):
     places = {
         write_lerobot(tmp_path / "video", "v3.0", lengths=(12, 9, 10)): frame * 8,
         write_lerobot(tmp_path / "images", "v2.1", lengths=(12, 9, 10), camera="image"): 12 * len(png(picture(0))) // 2,
-        write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4)): 4 * frame * 4,
+        write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4)): 4 * 2 * 32 * 32 * 3,
     }
     for place, least in places.items():
         facts = inspect_dataset(place, max_bytes=least // 2).facts

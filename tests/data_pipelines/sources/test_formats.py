@@ -321,6 +321,30 @@ def test_robomimic_is_read_where_it_lies(tmp_path):
     assert some.episode(0, VIEW.image_key, ()).steps == 23 and some.ids.tolist() == [open_source(path).ids[1]]
 
 
+def test_the_frames_of_a_robomimic_record_are_read_block_by_block(tmp_path):
+    """Files that were compressed have chunks of a hundred frames: one frame after the other took a hundred times as
+    long. A camera that is no camera in one demonstration says so when its frames are asked for."""
+
+    def compress(file):
+        for camera in ("agentview", "robot0_eye_in_hand"):
+            obs = file["data/demo_10/obs"]
+            frames = obs[f"{camera}_image"][()]
+            del obs[f"{camera}_image"]
+            obs.create_dataset(f"{camera}_image", data=frames, chunks=(20, 32, 32, 3), compression="gzip")
+        del obs["robot0_eye_in_hand_image"]
+        obs["robot0_eye_in_hand_image"] = frames.astype(np.uint16)
+        del file["data/demo_11/obs/robot0_eye_in_hand_image"]
+
+    source = open_source(write_robomimic(tmp_path / "image.hdf5", lengths=(5, 70, 4), change=compress))
+    record = source.record(1, keys := ["steps/observation/agentview", "steps/observation/robot0_eye_in_hand"])
+    shown, spoilt = (record[key] for key in keys)
+    assert [number(frame) for frame in shown] == [24 + t for t in range(70)]
+    assert shown.nbytes == 70 * 32 * 32 * 3 and len(spoilt) == 70
+    with pytest.raises(EpisodeError, match=r"demo_10/obs/robot0_eye_in_hand_image is uint16 \[70, 32, 32, 3\]"):
+        spoilt[0]
+    assert source.record(2, keys).keys() == {keys[0]}, "absent, like any other field that it lacks"
+
+
 def test_the_masks_of_a_robomimic_file_can_say_what_is_held_out(tmp_path):
     def share(file):
         file["mask/half"] = np.array([b"demo_9", b"demo_10"])
