@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError, without_advice
-from data_pipelines.export.fields import LeRobotFields
+from data_pipelines.export.fields import ACTION, STATE, LeRobotFields
 from data_pipelines.export.statistics import COMBINED, combine, of_values, quantiles
 from data_pipelines.export.tables import INDEXED_BY_TASK, arrow, arrow_type, vectors, write_table
 from data_pipelines.export.video import VideoWriter, pixel_format
@@ -29,6 +29,7 @@ from data_pipelines.publishing.files import publish, sync
 from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.sources.convertible import require_module
 from data_pipelines.sources.lerobot import EPISODE, REWARD, SUCCESS, TASK, TIME
+from data_pipelines.sources.rlds.schema import field_slice
 from data_pipelines.sources.source import (
     INSTRUCTION_KEYS,
     REWARD_KEY,
@@ -47,7 +48,7 @@ from hma_jax.runtime.files import write_file
 if TYPE_CHECKING:
     import pyarrow as pa
 
-EXPORTER_VERSION = 1
+EXPORTER_VERSION = 2
 """Raise it when other files are written for the same source."""
 
 FILE_BYTES = 2**31
@@ -200,10 +201,7 @@ class _Writer:
         for name, of in frames.items():
             if len(of) != steps or isinstance(of, np.ndarray):
                 raise unusable(f"{self._fields.cameras[name]!r} has {len(of)} frames of {steps}.")
-        columns = {
-            name: join_actions(record, keys, self._source.features, steps, unusable)
-            for name, keys in self._fields.vectors.items()
-        }
+        columns = {name: self._vector(name, record, steps, unusable) for name in self._fields.vectors}
         if REWARD_KEY in record:
             rewards = np.asarray(record[REWARD_KEY], np.float32).reshape(-1, 1)
             if len(rewards) != steps or not np.isfinite(rewards).all():
@@ -222,6 +220,18 @@ class _Writer:
         shapes = {name: self._shape(name, of, unusable) for name, of in frames.items()}
         self._dtypes, self._shapes = dtypes, shapes
         return _Episode(i, columns, frames, find_instructions(record, steps))
+
+    def _vector(
+        self, name: str, record: Mapping[str, Any], steps: int, unusable: Callable[[str], EpisodeError]
+    ) -> np.ndarray:
+        """[steps, size]: float32, or int64 if all its fields are integers, such as clocks, which float32 would round.
+        Policies take an action and a state as float32."""
+        keys = self._fields.vectors[name]
+        joined = join_actions(record, keys, self._source.features, steps, unusable)
+        parts = [(record[field], part) for field, part in map(field_slice, keys)]
+        if name in (ACTION, STATE) or any(values.dtype.kind not in "iu" for values, _ in parts):
+            return joined
+        return np.concatenate([values.reshape(steps, -1)[:, part] for values, part in parts], axis=1).astype(np.int64)
 
     def _shape(
         self, camera: str, frames: Sequence[SourceFrame], unusable: Callable[[str], EpisodeError]

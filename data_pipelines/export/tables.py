@@ -41,7 +41,7 @@ def arrow(values: np.ndarray) -> pa.Array:
 
 
 def vectors(column: pa.ChunkedArray) -> np.ndarray:
-    """float32 [N, size]; the reverse of `arrow`."""
+    """[N, size]; the reverse of `arrow`."""
     from pyarrow import compute, types
 
     flat = compute.list_flatten(column) if types.is_fixed_size_list(column.type) else column

@@ -119,7 +119,8 @@ class RobomimicDataset(EpisodeSource):
                         found[key] = _LazyFrames(self, i, path, len(demo[path]))
                 elif key in self.features:
                     if _path(key) in demo:
-                        found[key] = read_rows(demo, _path(key), where).astype(np.float32).ravel()
+                        rows = read_rows(demo, _path(key), where).ravel()
+                        found[key] = rows if rows.dtype.kind in "iu" else rows.astype(np.float32)
                 elif key == INSTRUCTION_KEY:
                     found[key] = [self._read.text.encode()] * max(int(self._lengths[i]), 0)
                 elif key == SUCCESS_KEY and (success := self._success(demo, where)) is not None:

@@ -18,7 +18,15 @@ from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.features import FlatFeature
 from data_pipelines.sources.source import action_fields
 from hma_jax.config import ConfigError
-from tests.data_pipelines.convert.sources import FPS, HEIGHT, WIDTH, lerobot_actions, number, write_lerobot
+from tests.data_pipelines.convert.sources import (
+    FPS,
+    HEIGHT,
+    WIDTH,
+    lerobot_actions,
+    number,
+    write_lerobot,
+    write_robomimic,
+)
 from tests.data_pipelines.fakes import make_spec, png, write_rlds
 
 
@@ -142,6 +150,30 @@ def test_a_file_of_small_frames_has_not_more_of_them_than_one_of_larger_ones(tmp
     source = open_source(write_rlds(tmp_path, make_spec(), [3, 3]))
     export(source, tmp_path / "new", file_bytes=3 * FRAME_BYTES)
     assert len(list((tmp_path / "new" / "data").rglob("*.parquet"))) == 2
+
+
+def test_integers_are_written_exactly(tmp_path):
+    """Clocks, for example: as float32 all steps were equal. An action stays float32, which policies need."""
+    clock = 10**15 + np.arange(5)
+
+    def change(file):
+        demo = file["data/demo_9"]
+        del demo["actions"]
+        demo["obs/clock"], demo["obs/ticks"], demo["actions"] = (
+            clock,
+            np.stack([clock, -clock], 1),
+            np.ones((5, 2), int),
+        )
+
+    source = open_source(write_robomimic(tmp_path / "image.hdf5", lengths=(5,), change=change))
+    export(source, tmp_path / "new")
+    table = pq.read_table(tmp_path / "new" / "data" / "chunk-000" / "file-000.parquet")
+    assert table["observation.clock"].to_pylist() == clock.tolist()
+    assert table["observation.ticks"].to_pylist() == [[t, -t] for t in clock.tolist()]
+    features = json.loads((tmp_path / "new" / "meta" / "info.json").read_text())["features"]
+    names = ("observation.clock", "action", "observation.robot0_eef_pos")
+    assert [features[name]["dtype"] for name in names] == ["int64", "float32", "float32"]
+    assert LeRobotDataset(tmp_path / "new").features["steps/observation/ticks"].size == 2
 
 
 def test_texts_that_change_within_an_episode_are_tasks(tmp_path):
