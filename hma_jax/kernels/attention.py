@@ -13,6 +13,7 @@ import jax
 
 from hma_jax.config import require
 from hma_jax.kernels import cpu, cudnn, plain, splash
+from hma_jax.runtime.devices import default_device
 
 Within = Callable[[jax.Array, float], jax.Array]
 """within(qkv, scale): qkv [B, T, P, 3, H, I] -> [B, T, P, H, I]; a token sees all tokens of its frame."""
@@ -55,7 +56,7 @@ def find_backend(name: str) -> Backend:
     of the default device. Raises ConfigError for an unknown name, and for a kernel that does not run on the
     platform."""
     mesh_device = jax.sharding.get_abstract_mesh().abstract_device
-    platform = mesh_device.platform if mesh_device else jax.default_backend()
+    platform = (mesh_device or default_device()).platform
     suits = backend_of(platform)
     name = suits if name == "auto" else name
     require(name in BACKENDS, f"execution.attention {name!r} is unknown; known: auto, {', '.join(BACKENDS)}")

@@ -1,6 +1,7 @@
 """Every backend of attention has the values and the gradients of the plain one."""
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import NamedTuple, get_args
 
 import jax
@@ -143,7 +144,7 @@ def test_on_a_tpu_no_array_of_attention_weights_is_made():
 
 @pytest.mark.parametrize(("platform", "own"), [("cpu", "cpu"), ("gpu", "cudnn"), ("tpu", "splash"), ("metal", "plain")])
 def test_every_backend_on_offer_is_known_where_it_runs_and_another_is_refused(platform, own, monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    monkeypatch.setattr(attention, "default_device", lambda: SimpleNamespace(platform=platform))
     for name in ("plain", "cpu", own):
         assert attention.find_backend(name) is attention.BACKENDS[name]
     assert attention.find_backend("auto") is attention.BACKENDS[own]
@@ -158,11 +159,19 @@ def test_every_backend_on_offer_is_known_where_it_runs_and_another_is_refused(pl
 
 def test_the_backend_is_that_of_the_devices_that_are_compiled_for(monkeypatch):
     """`hma plan` compiles for others than the default one."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
+    monkeypatch.setattr(attention, "default_device", lambda: SimpleNamespace(platform="tpu"))
     with jax.set_mesh(jax.make_mesh((1,), ("data",), devices=jax.devices("cpu")[:1])):
         found = []
         jax.jit(lambda x: found.append(attention.find_backend("auto")) or x)(0.0)
     assert found == [attention.BACKENDS["cpu"]]
+
+
+@pytest.mark.parametrize("platform", ["gpu", "tpu"])
+def test_the_backend_is_that_of_the_default_device_and_not_of_the_fastest(platform: str, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)  # as where there is one
+    for device in ("cpu", jax.devices("cpu")[0]):
+        with jax.default_device(device):
+            assert attention.find_backend("auto") is attention.BACKENDS["cpu"]
 
 
 def test_large_frames_attend_one_by_one_on_cpu_and_say_the_same():
