@@ -160,6 +160,20 @@ def test_inspection_of_damaged_data_ends_with_a_command_that_leaves_the_damage_o
         assert "hma tokenize" in line and line.endswith(f" --set store.corrupt=skip{limit}")
 
 
+def test_what_was_not_read_may_be_damaged_as_often_as_what_was(tmp_path, capsys):
+    """Twice as often, since this is a sample. The command named the number of those that were read."""
+
+    def change(episode, features):
+        if episode % 4 == 0:
+            features["steps/action"][7] = np.nan
+
+    data = write_rlds(tmp_path, make_spec("my_robot"), [12] * 80, change=change)
+    words = ["--hz", "4", "--entry", f"{tmp_path}/my.toml", "--out", f"{tmp_path}/sheet"]
+    assert main(["data", "inspect", str(data), *words]) == 0
+    share = float(capsys.readouterr().out.splitlines()[-1].rpartition(" --set store.max_skipped=")[2])
+    assert 20 / 80 < share < 1
+
+
 def test_inspection_of_episodes_without_a_window_leads_to_every_frame(robot, tmp_path, capsys):
     arguments = ["--hz", "40", "--entry", str(tmp_path / "my.toml"), "--frames", "9", "--out", str(tmp_path)]
     assert main(["data", "inspect", str(robot), *arguments]) == 0

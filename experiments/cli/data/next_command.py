@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -59,10 +60,10 @@ def tokenize_command(
         changes["eval.prompt_frames"] = prompt
     if rate is not None:
         changes["rate"] = f"{rate:g}"
-    if damaged := max(_unusable(facts) for facts in datasets):
+    if any(map(_unusable, datasets)):
         changes["store.corrupt"] = "skip"
-        if damaged > preset.store.max_skipped:
-            changes["store.max_skipped"] = damaged
+        if limit := _more_skipped(datasets, preset.store.max_skipped):
+            changes["store.max_skipped"] = limit
     settings = tuple(f"{name}={value}" for name, value in changes.items())
     arguments = StudyArguments(
         preset_name, data=tuple(facts.directory for facts in datasets), registry=registry, set=settings
@@ -80,6 +81,17 @@ def _unusable(facts: Facts) -> int:
     fields = chosen_actions(facts, find_reader(facts.name))
     broken = {episode for field in fields for value in field.dimensions for episode in value.broken}
     return sum(facts.damaged.values()) + len(broken)
+
+
+def _more_skipped(datasets: Sequence[Facts], allowed: float) -> float | None:
+    """`store.max_skipped` for datasets with more unusable episodes than are `allowed`: their number, if all episodes
+    were read, or else twice the share of those that were; None if no dataset has more."""
+    if all(facts.sampled + sum(facts.damaged.values()) >= facts.episodes for facts in datasets):
+        return damaged if (damaged := max(map(_unusable, datasets))) > allowed else None
+    shares = [_unusable(facts) / (facts.sampled + sum(facts.damaged.values())) for facts in datasets]
+    if all(2 * share * facts.episodes <= allowed for share, facts in zip(shares, datasets, strict=True)):
+        return None
+    return min(math.ceil(200 * max(shares)) / 100, 0.99)
 
 
 def _another_out(default: Path, names: Sequence[str]) -> Path | None:
