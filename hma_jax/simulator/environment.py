@@ -11,7 +11,7 @@ Instead of `run`, `simulator` takes anything with the interface of `interface.An
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -21,9 +21,10 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
 from hma_jax.config import require
-from hma_jax.simulator.interface import Actions, AnySimulator, Judge, no_judge, require_frame_steps
+from hma_jax.simulator.interface import AnySimulator, Judge, no_judge, require_frame_steps
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -122,10 +123,14 @@ class _Task:
             self.judge.begin(self.simulator, episodes)
         return images
 
-    def step(self, actions: Actions) -> np.ndarray:
-        """As the simulator's `step`."""
+    def step(self, actions: Iterable[ArrayLike], ended: Sequence[int] = ()) -> np.ndarray:
+        """As the simulator's `step`, in which the episodes `ended` wait. Raises ConfigError if the action of another
+        one is None: it would wait too, but the step would count."""
         self._refuse_others_episodes()
-        return self.simulator.step(actions)
+        given = [None if b in ended else action for b, action in enumerate(actions)]
+        missing = [b for b, action in enumerate(given) if action is None and b not in ended]
+        require(not missing, f"an environment needs an action for every step, but that of episode {missing} is None")
+        return self.simulator.step(given)
 
     def _refuse_others_episodes(self) -> None:
         """Raises ConfigError if another environment began the simulator's episodes: stepping would continue those under
@@ -266,7 +271,7 @@ class RobotVectorEnv(VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         simulator, again = self._task.simulator, self._over.copy()
         which = np.flatnonzero(again).tolist()
-        self._task.step([None if b in which else action for b, action in enumerate(actions)])
+        self._task.step(actions, which)
         info = {"clipped": self._task.clipped(), "_clipped": ~again}
         rewards, done = self._task.judge(simulator)  # before ended episodes restart: starts are not judged
         if which:

@@ -228,6 +228,18 @@ def test_a_start_that_is_none_is_refused(start_):
             env.reset(options={"start": start_})
 
 
+def test_a_step_without_an_action_is_refused():
+    """The episode waited, and the step counted."""
+    for env, none in (
+        (RobotEnv(simulator=simulator(), starts=STARTS, robot="arm"), None),
+        (vector(2), [ROBOTS[1].low, None]),
+    ):
+        env.reset(seed=0)
+        with pytest.raises(ConfigError, match="needs an action for every step, but that of episode .* is None"):
+            env.step(none)
+        assert set(env._task.simulator.counts) == {2}
+
+
 def test_native_actions_are_no_steps_of_an_environment():
     with pytest.raises(ConfigError, match="not native actions"):
         RobotEnv(simulator=simulator(rate="native"), starts=STARTS, robot="arm")
