@@ -132,6 +132,18 @@ class _Task:
         require(not missing, f"an environment needs an action for every step, but that of episode {missing} is None")
         return self.simulator.step(given)
 
+    def judged(self) -> tuple[np.ndarray, np.ndarray]:
+        """What the judge says: (rewards [B], bool [B]). Raises ConfigError for anything else."""
+        rewards, done = map(np.asarray, self.judge(self.simulator))
+        count = len(self.simulator)
+        require(
+            rewards.shape == done.shape == (count,) and rewards.dtype.kind in "fiub" and done.dtype == bool,
+            f"a judge must return rewards, numbers [{count}], and whether the episodes are over, bool [{count}]; it "
+            f"returned {rewards.dtype} {list(rewards.shape)} and {done.dtype} {list(done.shape)}",
+        )
+        require(bool(np.isfinite(rewards).all()), f"the rewards of a judge must be finite, got {rewards}")
+        return rewards, done
+
     def _refuse_others_episodes(self) -> None:
         """Raises ConfigError if another environment began the simulator's episodes: stepping would continue those under
         this environment's actions."""
@@ -191,7 +203,7 @@ class RobotEnv(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         image = self._task.step([action])[0].copy()
-        rewards, done = self._task.judge(self._task.simulator)
+        rewards, done = self._task.judged()
         return image, float(rewards[0]), bool(done[0]), False, {"clipped": self._task.clipped()[0]}
 
     def render(self) -> np.ndarray | None:
@@ -269,18 +281,18 @@ class RobotVectorEnv(VectorEnv):
         self._rngs = [new[b] if b in which and new[b] is not None else known[b] for b in range(self.num_envs)]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        simulator, again = self._task.simulator, self._over.copy()
+        again = self._over.copy()
         which = np.flatnonzero(again).tolist()
         self._task.step(actions, which)
         info = {"clipped": self._task.clipped(), "_clipped": ~again}
-        rewards, done = self._task.judge(simulator)  # before ended episodes restart: starts are not judged
+        rewards, done = self._task.judged()  # before ended episodes restart: starts are not judged
         if which:
             self._task.begin([self._rngs[b] for b in which], which, None)
         self._steps = np.where(again, 0, self._steps + 1)
         terminated = done & ~again
         truncated = ~again & (self._steps >= self._longest)
         self._over = terminated | truncated
-        return simulator.images.copy(), np.where(again, 0.0, rewards), terminated, truncated, info
+        return self._task.simulator.images.copy(), np.where(again, 0.0, rewards), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         return tuple(self._task.simulator.images.copy()) if self.render_mode == "rgb_array" else None

@@ -127,6 +127,26 @@ def test_a_judge_is_told_of_episodes_that_begin():
     np.testing.assert_array_equal(judge.begun[1][1][0], images[0])
 
 
+@pytest.mark.parametrize("several", [False, True])
+@pytest.mark.parametrize(
+    ("judge", "message"),
+    [
+        (lambda n: (np.ones((n, 1)), np.zeros(n, bool)), r"it returned float64 \[., 1\] and bool \[.\]"),
+        (lambda n: (1.0, np.zeros(n, bool)), r"it returned float64 \[\] and"),
+        (lambda n: (np.ones(n), np.zeros(n, int)), r"and int64 \[.\]"),
+        (lambda n: (np.ones(n), np.zeros(n)), r"and float64 \[.\]"),
+        (lambda n: (np.full(n, np.nan), np.zeros(n, bool)), "rewards of a judge must be finite, got .nan"),
+    ],
+)
+def test_what_is_no_judgement_is_refused(several, judge, message):
+    """It was broadcast, or ended other episodes; alone and in a vector it did different things."""
+    options = {"starts": STARTS, "robot": "arm", "judge": lambda simulator: judge(len(simulator))}
+    env = RobotVectorEnv(2, simulator=Still(2), **options) if several else RobotEnv(simulator=Still(1), **options)
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=message):
+        env.step(env.action_space.low)
+
+
 def test_a_clipped_action_is_said_alike_alone_and_in_a_vector():
     env = RobotEnv(simulator=simulator(), starts=STARTS, robot="arm")
     several = DictInfoToList(vector(2, max_episode_steps=1))
