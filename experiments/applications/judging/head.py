@@ -35,6 +35,7 @@ from experiments.applications.policies.network import (
     jitter_colour,
     mlp,
     random_shift,
+    require_images,
     stack_frames,
 )
 from experiments.applications.policies.tasks import Task, held
@@ -104,7 +105,9 @@ class SuccessHead(Head):
         self._apply = jax.jit(lambda params, frames: jax.nn.sigmoid(apply_head(params, config, as_floats(frames))))
 
     def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        """See `Head`."""
+        """See `Head`. Raises ConfigError for images of another kind."""
+        require_images(images)
+        require_images(first)
         size = self.config.encoder.size
         whole = (*images.shape[:-3], size, size, 3)
         small = [np.broadcast_to(downsample_uint8(x, size), whole) for x in (first, images)]

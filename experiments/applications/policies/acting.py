@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from experiments.applications.policies.demonstrations import Demonstrations
-from experiments.applications.policies.network import Params, as_floats, downsample_uint8
+from experiments.applications.policies.network import Params, as_floats, downsample_uint8, require_images
 from experiments.applications.policies.policy import Counts
 from hma_jax.config import require
 from hma_jax.simulator.interface import WholeNumbers
@@ -103,6 +103,7 @@ class ChunkPolicy:
             self._left[b] = []
 
     def act(self, images: np.ndarray) -> np.ndarray:
+        require_images(images, batch=True)
         if self._seen is None or len(self._seen) != len(images):
             self._seen = np.repeat(images[:, None], self.config.frames, 1)
             self._fresh, self._left = np.ones(len(images), bool), [[] for _ in images]

@@ -108,6 +108,17 @@ def spatial_softmax(maps: jax.Array, sharpness: jax.Array) -> jax.Array:
     return jnp.concatenate([x, y, jnp.tanh((weight * flat).sum(1) / 4)], -1)
 
 
+def require_images(images: np.ndarray, batch: bool = False) -> None:
+    """Raises ConfigError unless these are images uint8 [..., H, W, 3], or, as a `batch`, [B, H, W, 3]. Those in 0..1
+    would look black."""
+    shape = "[B, H, W, 3]" if batch else "[..., H, W, 3]"
+    require(
+        images.dtype == np.uint8 and images.ndim >= 3 and images.shape[-1] == 3 and images.size > 0
+        and (images.ndim == 4 or not batch),
+        f"policies and success heads need images uint8 {shape}, got {images.dtype} {list(images.shape)}",
+    )  # fmt: skip
+
+
 def require_multiples(height: int, width: int, size: int) -> None:
     """Raises ConfigError for images that cannot be averaged down to `size`."""
     require(

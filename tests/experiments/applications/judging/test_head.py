@@ -3,10 +3,12 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from experiments.applications.judging import head as of_head
 from experiments.applications.judging.head import HeadConfig, SuccessHead, fit_heads, train_head
 from experiments.applications.policies.network import EncoderConfig
+from hma_jax.config import ConfigError
 
 CONFIG = HeadConfig(encoder=EncoderConfig(8, (4, 4, 4), 8))
 
@@ -28,6 +30,24 @@ def test_a_head_is_trained_and_asked_with_the_first_frame_before_the_present_one
     asked = SuccessHead(CONFIG, {})
     asked.predict_pairs = lambda pairs: pairs[:, 1, 0, 0, 0] - 10.0 * pairs[:, 0, 0, 0, 0]
     np.testing.assert_array_equal(asked.probabilities(images, images[:, :1]), levels - 10.0 * levels[:, :1])
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        np.zeros((2, 8, 8, 3)),
+        np.zeros((2, 8, 8, 3), int),
+        np.zeros((2, 8, 8), np.uint8),
+        np.zeros((0, 8, 8, 3), np.uint8),
+    ],
+    ids=["in 0..1", "int64", "grey", "none"],
+)
+def test_a_head_is_asked_of_images_of_256_levels(images):
+    """Those in 0..1 were rounded, and looked black."""
+    usual = np.zeros((2, 8, 8, 3), np.uint8)
+    for pair in ((images, usual[:1]), (usual, images)):
+        with pytest.raises(ConfigError, match=r"need images uint8 \[..., H, W, 3\], got "):
+            SuccessHead(CONFIG, {}).probabilities(*pair)
 
 
 def test_frames_with_success_weigh_as_much_together_as_those_without(monkeypatch):

@@ -239,6 +239,23 @@ def test_an_episode_that_begins_anew_forgets_its_past_and_the_others_keep_theirs
     assert [len(left) for left in policy._left] == [2, 1]
 
 
+@pytest.mark.parametrize(
+    "images",
+    [
+        np.zeros((2, 8, 8, 3)),
+        np.zeros((2, 8, 8, 3), int),
+        np.zeros((8, 8, 3), np.uint8),
+        np.zeros((0, 8, 8, 3), np.uint8),
+    ],
+    ids=["in 0..1", "int64", "one", "none"],
+)
+def test_a_policy_acts_after_images_of_256_levels(images):
+    """After those in 0..1, which look black, it acted too."""
+    policy = ClonedPolicy(BcConfig(encoder=SMALL), {}, Scale((0.0,), (1.0,), (0.0,), (1.0,)))
+    with pytest.raises(ConfigError, match=r"need images uint8 \[B, H, W, 3\], got "):
+        policy.act(images)
+
+
 def test_a_new_chunk_is_planned_when_as_many_actions_as_configured_were_executed(monkeypatch, demos):
     config, planned = BcConfig(encoder=SMALL, chunk=3, execute=2), []
     policy = ClonedPolicy(config, {}, Scale((0.0,), (1.0,), (0.0,), (99.0,)))
