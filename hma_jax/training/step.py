@@ -41,7 +41,8 @@ Batch = dict[str, jax.Array]
 
 Optional:
 
-    real            bool [B, T]: False for padding frames at the end of a short window
+    real            bool [B, T]: False for padding frames at the end of a short window; all batches of a run have it, or
+                    none
     seed            uint32 [2]: `jax.random.key_data` of the seed's key (`key_of`); with it, runs of different seeds
                     share one compiled step
 """

@@ -81,8 +81,12 @@ def train_model(
     def put(batch: Any) -> Any:
         return put_batch(batch if scale is None else _normalised(batch, scale), device_mesh)
 
+    padded: set[bool] = set()  # whether batches have `real`
+
     def put_checked(batch: Any) -> Any:
         check_batch(batch, rows, model, table)
+        padded.add("real" in batch)
+        require(len(padded) == 1, "some batches have `real`, the marks of padding, and some do not; give it with all")
         return put(batch) | {"seed": seed}
 
     def modernised(described: dict[str, Any]) -> dict[str, Any]:
@@ -138,14 +142,16 @@ def _may_change(
 def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, table: EmbodimentTable) -> None:
     """Raises ConfigError for a host batch that is not as `step.Batch` says, or does not have `rows` rows.
 
-    Without this check a step would compute with ids and robots that do not exist, and with fewer rows than
-    `TrainConfig.batch` says.
+    Without this check a step would compute with ids and robots that do not exist, with fewer rows than
+    `TrainConfig.batch` says, and with marks of padding that are not those of its frames.
     """
     wanted = {
         "tokens": (rows, model.frames, *model.frame_shape),
         "actions": (rows, model.frames, table.action_width),
         "embodiment": (rows,),
     }
+    if "real" in batch:
+        wanted["real"] = rows, model.frames
     require_shapes("a batch of this run has", {name: batch.get(name) for name in wanted}, wanted)
     numbers = {"embodiment": ("robots", table.size)}
     if not model.diffusion:
@@ -154,6 +160,9 @@ def check_batch(batch: Mapping[str, np.ndarray], rows: int, model: ModelConfig, 
         kind = batch[name].dtype
         require(np.issubdtype(kind, np.integer), f"a batch has {what} of type {kind}, not integers")
         require_below(count, batch[name], f"a batch has {what}")
+    if "real" in batch:
+        kind = batch["real"].dtype
+        require(np.issubdtype(kind, np.bool_), f"a batch has marks of padding, `real`, of type {kind}, not bool")
 
 
 def _normalised(batch: Mapping[str, np.ndarray], scale: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:

@@ -366,13 +366,23 @@ ROWS = next(batches(MODEL, 4)(0))
         (ROWS | {"embodiment": ROWS["embodiment"] - 1}, "a batch has robots from -1 to 1, but the model allows 0 to 2"),
         (ROWS | {"embodiment": ROWS["embodiment"].tolist()}, r"has embodiment \(4,\), got list"),
         (ROWS | {"tokens": ROWS["tokens"] / 2}, "a batch has ids of type float64, not integers"),
+        (ROWS | {"real": np.ones(4, bool)}, r"has real \(4, 3\), got \(4,\)"),
+        (ROWS | {"real": np.ones((4, 3))}, "a batch has marks of padding, `real`, of type float64, not bool"),
     ],
-    ids=["fewer rows", "no actions", "ids", "robots", "list", "halves"],
+    ids=["fewer rows", "no actions", "ids", "robots", "list", "halves", "real windows", "real numbers"],
 )
 def test_batches_of_another_model_are_refused(batch, message, tmp_path: Path):
-    """Such ids and fewer rows were trained on without a word; other robots were told as a divergence."""
+    """Such ids and fewer rows were trained on without a word; other robots were told as a divergence. Whole windows
+    that are marked as real, instead of frames, were taken for frames."""
     with pytest.raises(ConfigError, match=message):
         train_model(MODEL, TABLE, AVERAGED, lambda start: iter([batch]), run_dir=tmp_path, provenance={})
+
+
+def test_a_run_whose_batches_do_not_all_mark_their_padding_is_refused(tmp_path: Path):
+    """It ended in an error of JAX about trees."""
+    later_marked = [ROWS, ROWS | {"real": np.ones((4, 3), bool)}]
+    with pytest.raises(ConfigError, match="some batches have `real`, .* and some do not; give it with all"):
+        train_model(MODEL, TABLE, AVERAGED, lambda start: iter(later_marked), run_dir=tmp_path, provenance={})
 
 
 def test_parameters_of_another_model_and_words_that_are_not_json_are_refused(tmp_path: Path):
