@@ -29,6 +29,7 @@ from data_pipelines.sources.source import (
     SUCCESS_KEY,
     EpisodeSource,
     SourceFrame,
+    action_fields,
     decode_frame,
     find_instructions,
     find_success,
@@ -78,7 +79,7 @@ class CameraFacts:
     frames: int  # frames that were decoded
     blank: int  # of these, frames of one colour
     still: bool  # in every sampled episode all frames are the same
-    undecodable: int = 0  # sampled episodes in which a frame of it cannot be decoded; their other cameras are read
+    undecodable: int = 0  # sampled episodes in which a frame of it is missing or cannot be decoded; others are read
     reason: str = ""  # why, in the first of these
 
     @property
@@ -152,7 +153,7 @@ def inspect_dataset(
     Reads `episodes`, drawn by hash, or fewer if they exceed `max_bytes`; `frames` of each camera are decoded in the
     first `max_examples`, two in the others. Fields of numbers count as actions if their name says so, or if an entry
     uses them as its `action_keys`. Damaged records are counted and left out. A camera that cannot be decoded in an
-    episode is counted, and the others are read.
+    episode, or has another number of frames than its action, is counted, and the others are read.
 
     Raises DataError for a directory that is no dataset or has no readable episode, ConfigError for an
     unknown split.
@@ -190,7 +191,7 @@ def inspect_dataset(
         steps=tuple(log.steps),
         lengths=_lengths(log.steps),
         cameras=tuple(camera.facts() for camera in log.cameras.values()),
-        actions=tuple(ActionFacts(key, dimension_facts(rows)) for key, rows in log.actions.items()),
+        actions=tuple(ActionFacts(key, dimension_facts(rows)) for key, rows in log.actions.items() if rows),
         damaged=dict(damaged),
         hz=source.hz,
         stopped=stopped,
@@ -261,6 +262,9 @@ class _SampleLog:
         sizes = {f.key: source.features[step_key(f.key)].size for f in fields if f.per_step and f.kind == "number"}
         taken = {"action", "actions", *(field_slice(key)[0] for key in action_keys)}
         self._numbers = [k for k, n in sizes.items() if n and (k in taken or "action" in k and n <= MAX_ACTION_WIDTH)]
+        used = {field_slice(key)[0] for key in action_keys} or action_fields(self._numbers)
+        self._action = [key for key in self._numbers if key in used]  # what an episode must have
+        self._sizes = {key: sizes[key] for key in self._numbers}
         self.actions: dict[str, list[np.ndarray]] = {key: [] for key in self._numbers}  # field -> [N, A] per episode
         self.steps: list[int] = []
         self.examples: list[ExampleEpisode] = []
@@ -273,10 +277,10 @@ class _SampleLog:
         is_example = len(self.examples) < self._max_examples
         try:
             record = _read(source, i, self.cameras, self._numbers)
-            count = _steps(record, source, self.cameras, self._numbers)
+            count = _steps(record, source, self.cameras, self._action)
             wanted = self._frames if is_example else 2
             times = tuple(np.unique(np.linspace(0, count - 1, wanted).round().astype(int)).tolist())
-            looked = _look(record, self.cameras, times, describe(source.runs, number))
+            looked = _look(record, self.cameras, count, times, describe(source.runs, number))
         except EpisodeError as error:
             source.skip(i, error)
             return
@@ -285,10 +289,16 @@ class _SampleLog:
             return
         self.bytes_read += sum(_size(values) for values in record.values())
         self.steps.append(count)
-        actions = {key: np.asarray(record[step_key(key)]).reshape(count, -1) for key in self._numbers}
+        found = {key: np.asarray(record[step_key(key)]) for key in self._numbers}
+        actions = {
+            key: values.reshape(count, -1)
+            for key, values in found.items()
+            if values.dtype.kind in "biuf" and values.size == count * self._sizes[key]
+        }
         for key, rows in actions.items():
             self.actions[key].append(rows)
-        self.fingerprints.append(take_fingerprint(*_named(source, i), count, looked, list(actions.values())))
+        compared = [actions.get(key, np.full((count, size), np.nan)) for key, size in self._sizes.items()]
+        self.fingerprints.append(take_fingerprint(*_named(source, i), count, looked, compared))
         if is_example:
             self.examples.append(_example(number, count, record, times, looked, actions))
 
@@ -310,34 +320,45 @@ def _read(source: EpisodeSource, i: int, cameras: dict, numbers: Sequence[str]) 
     return {key: [] for key in keys} | record
 
 
-def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence[str]) -> int:
-    """Number of steps of an episode. Raises ValueError if its fields disagree."""
-    for key in (*cameras, *numbers):
-        values = record[step_key(key)]
-        if len(values) and isinstance(values, np.ndarray) != (key in numbers):
-            raise ValueError(f"its {key} holds {'bytes' if key in numbers else 'numbers'}")
-    counts = {key: len(record[step_key(key)]) for key in cameras}
-    frames, other_widths = max(counts.values(), default=0), {}
-    for key in numbers:
+def _steps(record: dict, source: EpisodeSource, cameras: dict, action: Sequence[str]) -> int:
+    """Number of steps of an episode: of its action, or else of its longest camera. Raises ValueError if the fields of
+    the action disagree, or if no camera has as many frames."""
+    for key in action:
+        if len(values := record[step_key(key)]) and not isinstance(values, np.ndarray):
+            raise ValueError(f"its {key} holds bytes")
+    counts = {key: _count_frames(record[step_key(key)]) for key in cameras}
+    frames, shown, other_widths = max(counts.values(), default=0), set(counts.values()), {}
+    for key in action:
         values, size = len(record[step_key(key)]), source.features[step_key(key)].size
         counts[key] = values / size
         if frames and values and values != frames * size and not values % frames:
             other_widths[key] = f" of {size} values, or {frames} of {values // frames}"
     if not counts:
         counts["is_first"] = len(record.get("steps/is_first", ()))
-    if len(set(counts.values())) != 1 or not max(counts.values()):
+    steps = {counts[key] for key in action} or {max(counts.values())}
+    if len(steps) != 1 or not max(steps) or cameras and not steps <= shown:
         found = ", ".join(f"{key} {n:g}{other_widths.get(key, '')}" for key, n in counts.items())
         raise ValueError(f"its fields differ in length, or it has no step ({found})")
-    return int(max(counts.values()))
+    return int(max(steps))
 
 
-def _look(record: dict, cameras: dict[str, _CameraLog], times: Sequence[int], where: str) -> dict[str, list]:
-    """The frames at `times` of every camera that can be decoded; the logs count those that cannot. One broken camera is
-    no failure, since an entry takes only one. Raises EpisodeError if no camera can be decoded."""
+def _count_frames(values: Sequence) -> int:
+    return 0 if isinstance(values, np.ndarray) else len(values)  # numbers in the place of images
+
+
+def _look(
+    record: dict, cameras: dict[str, _CameraLog], steps: int, times: Sequence[int], where: str
+) -> dict[str, list]:
+    """The frames at `times` of every camera that has one for each step and can be decoded; the logs count those that
+    cannot. One broken camera is no failure, since an entry takes only one. Raises EpisodeError if no camera can be
+    decoded."""
     looked, failures = {}, {}
     for key, log in cameras.items():
+        frames = record[step_key(key)]
         try:
-            looked[key] = log.look(record[step_key(key)], times, where)
+            if (count := _count_frames(frames)) != steps:
+                raise EpisodeError(f"{where}: {key} has {count} frames, but there are {steps} steps")
+            looked[key] = log.look(frames, times, where)
         except EpisodeError as error:
             failures[key] = error
     if failures and not looked:
@@ -368,7 +389,7 @@ class _CameraLog:
         return images
 
     def fail(self, error: EpisodeError) -> None:
-        """Records an episode in which a frame cannot be decoded."""
+        """Records an episode in which a frame is missing or cannot be decoded."""
         self.undecodable += 1
         self.reason = self.reason or without_advice(str(error))
 

@@ -114,8 +114,8 @@ def _cameras(facts: Facts, entry: DatasetSpec | None) -> list[Issue]:
         whose = "the camera in use" if used else "not in use"
         if camera.undecodable:
             text = (
-                f"{camera.key} ({whose}): frames of {camera.undecodable} of {facts.sampled} episodes cannot be decoded; "
-                f"the first: {camera.reason.rstrip('.')}"
+                f"{camera.key} ({whose}): frames of {camera.undecodable} of {facts.sampled} episodes are missing or cannot "
+                f"be decoded; the first: {camera.reason.rstrip('.')}"
             )
             issues.append(Issue("error" if used else "warning", "undecodable frames", text))
         if camera.is_blank:

@@ -192,7 +192,8 @@ def _episode(d: DatasetView, example: ExampleEpisode) -> str:
         words.append("success" if example.success else "failure")
     text = " ".join(example.instruction.split())
     instruction = f"<p>“{html.escape(text[:160])}{'…' if len(text) > 160 else ''}”</p>" if text else ""
-    drawn = "".join(_curves(field, example) for field in chosen_actions(d.facts, d.entry))
+    shown = [field for field in chosen_actions(d.facts, d.entry) if field_slice(field.key)[0] in example.actions]
+    drawn = "".join(_curves(field, example) for field in shown)
     pictures = "".join(clips[:1]) + f"<div class=clips>{''.join(clips[1:])}</div>"
     return f"<div class=episode>{pictures}<p>{' · '.join(words)}</p>{instruction}{drawn}</div>"
 

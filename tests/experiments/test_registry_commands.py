@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_pipelines.inspection.inspect import ExampleEpisode
+from data_pipelines.inspection.inspect import CameraFacts, ExampleEpisode
 from data_pipelines.registry import get_spec, known_groups, toml_file
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
 from experiments import run_study
+from experiments.cli.data import next_command
 from experiments.cli.data import registry as registry_commands
 from experiments.cli.data.contact_sheet import TILE, draw_sheet
 from experiments.cli.data.registry import _write_entry
@@ -172,6 +173,13 @@ def test_what_was_not_read_may_be_damaged_as_often_as_what_was(tmp_path, capsys)
     assert main(["data", "inspect", str(data), *words]) == 0
     share = float(capsys.readouterr().out.splitlines()[-1].rpartition(" --set store.max_skipped=")[2])
     assert 20 / 80 < share < 1
+
+
+def test_episodes_without_frames_of_the_camera_in_use_are_left_out_by_the_command():
+    key, fine = get_spec("bridge").image_key, CameraFacts("observation/other", ((8, 8),), 4, 0, still=False)
+    for broken, expected in ((replace(fine, key=key, undecodable=2), 2), (replace(fine, undecodable=2), 0)):
+        facts = SimpleNamespace(name="bridge", damaged={}, actions=(), cameras=(fine, broken))
+        assert next_command._unusable(facts) == expected
 
 
 def test_inspection_of_episodes_without_a_window_leads_to_every_frame(robot, tmp_path, capsys):

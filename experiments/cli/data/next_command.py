@@ -74,13 +74,15 @@ def tokenize_command(
 
 
 def _unusable(facts: Facts) -> int:
-    """Sampled episodes that tokenising refuses: those that cannot be read, and those whose actions (as read by the
-    entry) are not all finite."""
+    """Sampled episodes that tokenising refuses: those that cannot be read, those whose actions (as read by the entry)
+    are not all finite, and those without all frames of the entry's camera."""
     from data_pipelines.inspection.issues import chosen_actions
 
-    fields = chosen_actions(facts, find_reader(facts.name))
+    entry = find_reader(facts.name)
+    fields = chosen_actions(facts, entry)
     broken = {episode for field in fields for value in field.dimensions for episode in value.broken}
-    return sum(facts.damaged.values()) + len(broken)
+    lacking = sum(c.undecodable for c in facts.cameras if entry is not None and c.key == entry.image_key)
+    return sum(facts.damaged.values()) + len(broken) + lacking
 
 
 def _more_skipped(datasets: Sequence[Facts], allowed: float) -> float | None:

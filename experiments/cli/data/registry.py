@@ -238,7 +238,7 @@ def print_facts(facts: Facts) -> None:
     for c in facts.cameras:
         if c.undecodable:
             text = f"{c.key} in {c.undecodable} of {facts.sampled} episodes, the first: {c.reason}"
-            console.print(f"[yellow]cannot be decoded[/] {escape(text)}", soft_wrap=True)
+            console.print(f"[yellow]missing or broken frames[/] {escape(text)}", soft_wrap=True)
     splits = tidy_table("Splits", "split", "episodes", "shards", "MB")
     for s in facts.splits:
         splits.add_row(s.name, f"{s.episodes:,}", f"{s.shards:,}", f"{s.bytes / 1e6:,.1f}")

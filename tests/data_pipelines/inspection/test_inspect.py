@@ -12,6 +12,7 @@ import pytest
 
 from data_pipelines.errors import DataError
 from data_pipelines.inspection.action_stats import dimension_facts
+from data_pipelines.inspection.duplicates import find_duplicates
 from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, inspect_dataset
 from data_pipelines.inspection.issues import find_issues
 from data_pipelines.inspection.suggest import choose_camera, suggest_entry, window_facts
@@ -199,7 +200,7 @@ def test_a_camera_that_cannot_be_decoded_costs_no_episode(tmp_path, spoilt):
         (said,) = [r for r in issues if r.title == "undecodable frames"]
         assert (
             said.severity == kind
-            and f"frames of {len(spoilt)} of 4 episodes cannot be decoded; the first: " in said.text
+            and f"frames of {len(spoilt)} of 4 episodes are missing or cannot be decoded; the first: " in said.text
         )
 
 
@@ -332,6 +333,33 @@ def test_records_that_are_no_episodes_are_told(tmp_path):
     tf.FeaturesDict({"image": tf.Image(shape=(8, 8, 3)), "label": tf.Text()}).save_config(str(directory))
     with pytest.raises(DataError, match=r"features.json: none of its fields \(image, label\) is below `steps`"):
         inspect_dataset(directory)
+
+
+def test_a_camera_or_a_field_that_a_study_does_not_take_costs_no_episode(tmp_path):
+    """Tokenising reads them all. Such episodes were called damaged, and it was advised to leave damaged ones out."""
+    from tensorflow_datasets import features as tf
+
+    def change(episode, features):
+        frames = features["steps/observation/image"]
+        features["steps/observation/wrist"] = frames[: 0 if episode == 1 else 4]
+        if episode != 2:
+            features["steps/action_dict/gripper"] = np.arange(5, dtype=np.float32)
+
+    directory = write_rlds(tmp_path, make_spec(), [5] * 4, change=change)
+    cameras = {name: tf.Image(shape=(8, 8, 3)) for name in ("image", "wrist")}
+    action, gripper = (tf.Tensor(shape=(size,), dtype=np.float32) for size in (3, 1))
+    step = {"observation": cameras, "action": action, "action_dict": {"gripper": gripper}}
+    tf.FeaturesDict({"steps": tf.Dataset(step)}).save_config(str(directory))
+    sample = inspect_dataset(directory)
+    facts = sample.facts
+    assert facts.sampled == 4 and not facts.damaged and not find_duplicates(sample.fingerprints)
+    image, wrist = facts.cameras
+    assert (image.undecodable, wrist.undecodable) == (0, 4)
+    assert "episode 0: observation/wrist has 4 frames, but there are 5 steps" in wrist.reason
+    assert {action.key: len(action.dimensions) for action in facts.actions} == {"action": 3, "action_dict/gripper": 1}
+    assert [len(example.actions) for example in sorted(sample.examples, key=lambda e: e.index)] == [2, 2, 1, 2]
+    used = inspect_dataset(directory, action_keys=["action_dict/gripper"]).facts
+    assert used.sampled == 3 and "action_dict/gripper 0" in next(iter(used.damaged))
 
 
 def test_an_instruction_in_numbers_is_no_text(tmp_path):
