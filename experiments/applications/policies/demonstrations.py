@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -71,10 +72,16 @@ def record(
 
     Several `noise` values get equal shares. The actions are the imprecise ones that were executed. `play`: restless
     behaviour instead of the expert. `after`: an episode ends this many frames after it succeeded (None: at its full
-    length). `only_successes` leaves failures out; episodes are then drawn until there are enough. Raises ConfigError if
-    the expert hardly ever succeeds.
+    length). `only_successes` leaves failures out; episodes are then drawn until there are enough. Raises ConfigError
+    for numbers that cannot be, and if the expert hardly ever succeeds.
     """
-    noises = [noise] if isinstance(noise, (int, float)) else list(noise)
+    noises = np.atleast_1d(noise).tolist()
+    require(count >= 1 and stride >= 1, f"count and stride must be at least 1, got {count} and {stride}")
+    require(after is None or after >= 0, f"after must not be negative, got {after}")
+    require(
+        bool(noises) and all(0 <= level < math.inf for level in noises),
+        f"noise must be one or more finite numbers that are not negative, got {noise}",
+    )
     counts = [count // len(noises) + (i < count % len(noises)) for i in range(len(noises))]
     parts, first = [], 0
     for level, wanted in zip(noises, counts, strict=True):

@@ -75,6 +75,28 @@ def test_as_many_are_recorded_as_were_asked_for_where_noises_share_them_unevenly
     assert len(found) == 3 == len(set(found.seeds.tolist()))
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"count": 0}, "count and stride must be at least 1, got 0 and 1"),
+        ({"stride": 0}, "count and stride must be at least 1, got 2 and 0"),
+        ({"after": -1}, "after must not be negative, got -1"),
+        ({"noise": float("nan")}, "noise must be one or more finite numbers that are not negative, got nan"),
+        ({"noise": (0.1, -0.1)}, "noise must be .* got .0.1, -0.1."),
+        ({"noise": []}, "noise must be one or more"),
+    ],
+)
+def test_what_cannot_be_recorded_is_said(options, message):
+    """With a stride of 0 nothing moved, and successes were cut off 1 frame before they came."""
+    with pytest.raises(ConfigError, match=message):
+        record(TASK, **{"count": 2, "image_size": 8, **options})
+
+
+def test_a_noise_may_be_a_number_of_numpy():
+    one, other = (record(TASK, 1, noise=noise, image_size=8) for noise in (0.5, np.float32(0.5)))
+    np.testing.assert_array_equal(one.actions, other.actions)
+
+
 def test_an_example_is_the_frames_seen_and_the_actions_from_there_on():
     """Padding, whose actions are 0, is no part of it nor of the scale."""
     images, actions = np.zeros((2, 3, 8, 8, 3), np.uint8), np.array([[[1], [2], [3]], [[11], [12], [0]]], np.float32)
