@@ -25,7 +25,7 @@ indicates encryption or an unknown compression, EOFError for an empty file, Toke
 array."""
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = True) -> None:
+def write_arrays(path: Path | str, arrays: Mapping[str, Any], compressed: bool = True) -> None:
     """Replaces the file. Raises OSError, in which case the old content stays."""
     content = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(content, **arrays)
@@ -33,7 +33,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = True)
 
 
 @contextmanager
-def reading_arrays(path: Path, advice: str) -> Iterator[Mapping[str, np.ndarray]]:
+def reading_arrays(path: Path | str, advice: str) -> Iterator[Mapping[str, np.ndarray]]:
     """The arrays of a file, while the block runs. Errors of the block in UNREADABLE count as damage too. Raises
     ConfigError, which ends with `advice`, if the file is missing, damaged or not what the block expects."""
     try:

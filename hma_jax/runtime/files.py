@@ -66,9 +66,10 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
-def write_file(path: Path, data: bytes | str) -> None:
+def write_file(path: Path | str, data: bytes | str) -> None:
     """Replaces the file: readers see either the old content or the new, even after a crash. Raises OSError, in which
     case the old content stays."""
+    path = Path(path)
     content = data.encode() if isinstance(data, str) else data
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:

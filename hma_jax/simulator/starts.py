@@ -47,7 +47,7 @@ class Start:
         return hash((self.robot, self.seed, self.images.tobytes()))
 
 
-def save_starts(starts: Sequence[Start], path: Path) -> None:
+def save_starts(starts: Sequence[Start], path: Path | str) -> None:
     """Writes all starts, compressed, or nothing."""
     arrays: dict[str, np.ndarray] = {}
     for i, start in enumerate(starts):
@@ -57,7 +57,7 @@ def save_starts(starts: Sequence[Start], path: Path) -> None:
     write_arrays(path, arrays)
 
 
-def load_starts(path: Path) -> tuple[Start, ...]:
+def load_starts(path: Path | str) -> tuple[Start, ...]:
     """Reads what `save_starts` wrote. Raises ConfigError for a file that is damaged or of another kind."""
     with reading_arrays(path, "make it again") as arrays:
         starts = []

@@ -10,19 +10,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
+from safetensors.numpy import save
 from scipy.stats import rankdata
 
 from experiments.applications.policies.demonstrations import Demonstrations
-from experiments.applications.policies.files import named, unnamed
+from experiments.applications.policies.files import named, read_network, unnamed
 from experiments.applications.policies.learning import FitConfig, Report, fit
 from experiments.applications.policies.network import (
     EncoderConfig,
@@ -39,7 +38,7 @@ from experiments.applications.policies.network import (
     stack_frames,
 )
 from experiments.applications.policies.tasks import Task, held
-from hma_jax.config import ConfigError, require
+from hma_jax.config import require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.kernels.random import key_of
 from hma_jax.runtime.files import write_file
@@ -210,8 +209,9 @@ def auroc(score: np.ndarray, label: np.ndarray) -> float:
     return float((rankdata(score)[positive].sum() - n * (n + 1) / 2) / (n * m))
 
 
-def save_head(head: SuccessHead, directory: Path) -> None:
+def save_head(head: SuccessHead, directory: Path | str) -> None:
     """The description is written last: a directory holds a complete head or none."""
+    directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     (directory / DESCRIPTION).unlink(missing_ok=True)
     write_file(directory / WEIGHTS, save(named(head.params)))
@@ -221,13 +221,10 @@ def save_head(head: SuccessHead, directory: Path) -> None:
     )
 
 
-def load_head(directory: Path) -> SuccessHead:
+def load_head(directory: Path | str) -> SuccessHead:
     """Loads a head. Raises ConfigError if there is none, or it is damaged."""
-    try:
-        description: dict[str, Any] = json.loads((directory / DESCRIPTION).read_text())
-        weights = load_file(directory / WEIGHTS)
-    except (OSError, ValueError, SafetensorError) as error:
-        raise ConfigError(f"{directory} cannot be read as a success head ({error}); train it again") from error
+    directory = Path(directory)
+    description, weights = read_network(directory / DESCRIPTION, directory / WEIGHTS, ("config", "measured"))
     config = from_dict(HeadConfig, description["config"], f"{directory}: config")
     like = jax.eval_shape(lambda: init_head(config, 0))
     return SuccessHead(config, unnamed(weights, like, directory), description["measured"])

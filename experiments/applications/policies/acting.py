@@ -27,6 +27,10 @@ class Scale:
     low: tuple[float, ...]  # the least value that was demonstrated
     high: tuple[float, ...]
 
+    def __post_init__(self):
+        lengths = {name: len(values) for name, values in vars(self).items()}
+        require(len(set(lengths.values())) == 1, f"a scale has a value for each dimension of an action, got {lengths}")
+
     def normalise(self, actions: np.ndarray) -> np.ndarray:
         return ((actions - np.array(self.mean)) / np.array(self.std)).astype(np.float32)
 

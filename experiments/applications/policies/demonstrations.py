@@ -114,12 +114,12 @@ def _finished(task: Task, driven: ExpertRollouts, seeds: np.ndarray, after: int 
     return Demonstrations(images, acted, lengths, done, solved.any(1), np.asarray(seeds, np.int64))
 
 
-def save_demonstrations(demos: Demonstrations, path: Path) -> None:
+def save_demonstrations(demos: Demonstrations, path: Path | str) -> None:
     """Writes the demonstrations, compressed, completely or not at all."""
     write_arrays(path, vars(demos))
 
 
-def load_demonstrations(path: Path) -> Demonstrations:
+def load_demonstrations(path: Path | str) -> Demonstrations:
     """What `save_demonstrations` wrote. Raises ConfigError for a file that is damaged or something else."""
     with reading_arrays(path, "record them again") as arrays:
         return Demonstrations(**{f.name: arrays[f.name] for f in fields(Demonstrations)})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,9 @@ from hma_jax.convert.tensors import write_safetensors
 DESCRIPTION, WEIGHTS = "policy.json", "weights.safetensors"
 
 
-def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] | None = None) -> None:
+def save_policy(policy: ChunkPolicy, directory: Path | str, about: Mapping[str, Any] | None = None) -> None:
     """Replaces `directory`, completely or not at all. `about` is added to its description: robot, task, step, seed."""
+    directory = Path(directory)
     making = directory.with_name(f".{directory.name}.{secrets.token_hex(4)}.tmp")
     making.mkdir(parents=True)
     try:
@@ -42,20 +43,32 @@ def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] |
         remove(making)
 
 
-def load_policy(directory: Path) -> ChunkPolicy:
+def load_policy(directory: Path | str) -> ChunkPolicy:
     """Loads a policy. Raises ConfigError if there is none, or it is damaged."""
-    try:
-        description = json.loads((directory / DESCRIPTION).read_text())
-        weights = load_file(directory / WEIGHTS)
-    except (OSError, ValueError, SafetensorError) as error:
-        raise ConfigError(f"{directory} cannot be read as a policy ({error}); train it again") from error
-    name = description.get("kind")
+    directory = Path(directory)
+    description, weights = read_network(directory / DESCRIPTION, directory / WEIGHTS, ("kind", "config", "scale"))
+    name = description["kind"]
     require(name in KINDS, f"{directory}: unknown kind of policy {name!r}; known: {', '.join(KINDS)}")
     kind = KINDS[name]
     config = from_dict(kind.config, description["config"], f"{directory}: config")
     scale = from_dict(Scale, description["scale"], f"{directory}: scale")
     wanted = jax.eval_shape(lambda: kind.init(config, len(scale.mean), 0))
     return kind.policy(config, unnamed(weights, wanted, directory), scale)
+
+
+def read_network(
+    description: Path, weights: Path, fields: Collection[str]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What describes a network, which must have `fields`, and its weights. Raises ConfigError if they are damaged."""
+    try:
+        described, arrays = json.loads(description.read_text()), load_file(weights)
+    except (OSError, ValueError, SafetensorError) as error:
+        raise ConfigError(f"{description.parent} cannot be read ({error}); train it again") from error
+    require(
+        isinstance(described, dict) and described.keys() >= set(fields),
+        f"{description} does not say all of {', '.join(fields)}; train it again",
+    )
+    return described, arrays
 
 
 def named(params: Any) -> dict[str, np.ndarray]:

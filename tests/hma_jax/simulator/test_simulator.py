@@ -494,8 +494,8 @@ def test_starts_are_read_as_they_were_written(tmp_path: Path):
     """Robots' names too, and in their order where the numbers differ in length."""
     first = start(0, 2)
     starts = [replace(first, robot="lab/arm", seed=3), replace(first, robot="lab/base")]
-    save_starts(starts, tmp_path / "few.npz")
-    assert load_starts(tmp_path / "few.npz") == tuple(starts)
+    save_starts(starts, str(tmp_path / "few.npz"))
+    assert load_starts(str(tmp_path / "few.npz")) == tuple(starts)
     given = {"images": first.images, "actions": first.actions, "seed": np.zeros(0, np.int64)}
     arrays = {f"{i}/{robot}/{name}": x for i, robot in ((10_000, "b"), (9999, "a")) for name, x in given.items()}
     write_arrays(tmp_path / "many.npz", arrays)

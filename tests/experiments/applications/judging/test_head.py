@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from experiments.applications.judging import head as of_head
-from experiments.applications.judging.head import HeadConfig, SuccessHead, fit_heads, train_head
+from experiments.applications.judging.head import (
+    HeadConfig,
+    SuccessHead,
+    fit_heads,
+    init_head,
+    load_head,
+    save_head,
+    train_head,
+)
 from experiments.applications.policies.network import EncoderConfig
 from hma_jax.config import ConfigError
 
@@ -48,6 +56,16 @@ def test_a_head_is_asked_of_images_of_256_levels(images):
     for pair in ((images, usual[:1]), (usual, images)):
         with pytest.raises(ConfigError, match=r"need images uint8 \[..., H, W, 3\], got "):
             SuccessHead(CONFIG, {}).probabilities(*pair)
+
+
+def test_a_head_is_read_as_it_was_written_and_refused_where_its_description_lacks_something(tmp_path):
+    where = str(tmp_path / "head")
+    save_head(SuccessHead(CONFIG, init_head(CONFIG, 0), {"frames": 1.0}), where)
+    assert load_head(where).measured == {"frames": 1.0} and load_head(where).config == CONFIG
+    for damaged in ("{}", "[]"):
+        (tmp_path / "head/head.json").write_text(damaged)
+        with pytest.raises(ConfigError, match="head.json does not say all of config, measured; train it again"):
+            load_head(where)
 
 
 def test_frames_with_success_weigh_as_much_together_as_those_without(monkeypatch):

@@ -243,6 +243,23 @@ def test_trained_policies_of_every_kind_do_the_same_when_saved_and_damaged_ones_
         load_policy(tmp_path / "one")
 
 
+def test_a_policy_whose_description_lacks_something_is_refused(demos, tmp_path):
+    """All of its actions were scaled alike, or it ended with another error."""
+    config = BcConfig(encoder=SMALL)
+    save_policy(ClonedPolicy(config, init_bc(config, 4, 0), scale_of(demos)), str(tmp_path / "one"))
+    path = tmp_path / "one/policy.json"
+    whole = json.loads(path.read_text())
+    assert load_policy(str(tmp_path / "one")).config == config
+    for damaged, message in (
+        ([], "does not say all of kind, config, scale"),
+        ({"kind": "cloned"}, "does not say all of kind, config, scale"),
+        (whole | {"scale": whole["scale"] | {"std": [1.0]}}, "a scale has a value for each dimension of an action"),
+    ):
+        path.write_text(json.dumps(damaged))
+        with pytest.raises(ConfigError, match=message):
+            load_policy(tmp_path / "one")
+
+
 @pytest.mark.parametrize("which", [[0], np.flatnonzero([True, False])], ids=["a list", "an array"])
 def test_an_episode_that_begins_anew_forgets_its_past_and_the_others_keep_theirs(demos, which):
     config = BcConfig(encoder=SMALL, chunk=3, execute=3)
