@@ -19,6 +19,7 @@ from hma_jax.simulator.interface import (
     Actions,
     WholeNumbers,
     chosen_episodes,
+    each_action,
     each_beginning,
     read_only,
     require_actions_between,
@@ -127,9 +128,9 @@ class TrueSimulator(ABC, Generic[W]):
         return self.images
 
     def step(self, actions: Actions) -> np.ndarray:
-        require(len(actions) == len(self), f"{len(self)} episodes need as many actions, got {len(actions)}")
+        each = each_action(actions, len(self))
         asked, clipped = {}, [()] * len(self)
-        for b, action in enumerate(actions):
+        for b, action in enumerate(each):
             if action is None:
                 continue
             world, robot = self._begun(b)

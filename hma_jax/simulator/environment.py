@@ -23,8 +23,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from hma_jax.config import require
-from hma_jax.simulator.interface import AnySimulator, Judge, no_judge, require_frame_steps
+from hma_jax.config import ConfigError, require
+from hma_jax.config.base import require_choice
+from hma_jax.simulator.interface import AnySimulator, Judge, each_start, no_judge, require_frame_steps, whole_numbers
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -33,6 +34,8 @@ ID = "HMA/Robot-v0"
 MAX_STEPS = 200
 """Frames after which an episode is truncated, unless `max_episode_steps` is passed to `gymnasium.make` or
 `gymnasium.make_vec`."""
+
+RENDER_MODES = (None, "rgb_array")
 
 
 def action_space(robot: Robot) -> gymnasium.spaces.Box:
@@ -76,8 +79,7 @@ class _Task:
             simulator = Simulator.load(run, episodes=episodes, **options)
         require_frame_steps(simulator, "an environment")
         require(len(simulator) == episodes, f"the simulator must have {episodes} episodes, but has {len(simulator)}")
-        if starts is None:
-            starts = getattr(simulator, "starts", ())
+        starts = each_start(getattr(simulator, "starts", ()) if starts is None else starts, 1)
         names = [name for name in simulator.robots if any(s.robot == name for s in starts)]
         require(
             bool(names),
@@ -141,7 +143,8 @@ class _Task:
             f"a judge must return rewards, numbers [{count}], and whether the episodes are over, bool [{count}]; it "
             f"returned {rewards.dtype} {list(rewards.shape)} and {done.dtype} {list(done.shape)}",
         )
-        require(bool(np.isfinite(rewards).all()), f"the rewards of a judge must be finite, got {rewards}")
+        if not np.isfinite(rewards).all():
+            raise ConfigError(f"the rewards of a judge must be finite, got {rewards}")
         return rewards, done
 
     def _refuse_others_episodes(self) -> None:
@@ -189,6 +192,7 @@ class RobotEnv(gymnasium.Env):
         **options: Any,
     ):
         """`options` are passed to `Simulator.load`. Raises ConfigError."""
+        require_choice(render_mode, RENDER_MODES, "render_mode")
         self._task = _Task(1, run, robot, simulator, starts, judge, options)
         self.robot = self._task.robot
         self.render_mode, self.metadata = render_mode, self._task.at_its_rate(self.metadata)
@@ -231,15 +235,17 @@ class RobotVectorEnv(VectorEnv):
         simulator: AnySimulator | None = None,
         starts: Sequence[Start] | None = None,
         judge: Judge = no_judge,
-        max_episode_steps: int = MAX_STEPS,
+        max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **options: Any,
     ):
-        """As `RobotEnv`; episodes are truncated after `max_episode_steps`."""
-        require(max_episode_steps >= 1, f"an episode has at least 1 step, got max_episode_steps={max_episode_steps}")
+        """As `RobotEnv`; episodes are truncated after `max_episode_steps` (None: MAX_STEPS)."""
+        [longest] = whole_numbers("max_episode_steps", [MAX_STEPS if max_episode_steps is None else max_episode_steps])
+        require(longest >= 1, f"an episode has at least 1 step, got max_episode_steps={longest}")
+        require_choice(render_mode, RENDER_MODES, "render_mode")
         self._task = _Task(num_envs, run, robot, simulator, starts, judge, options)
         self.robot = self._task.robot
-        self.num_envs, self.render_mode, self._longest = num_envs, render_mode, max_episode_steps
+        self.num_envs, self.render_mode, self._longest = num_envs, render_mode, longest
         self.metadata = self._task.at_its_rate(self.metadata)
         self.single_action_space = action_space(self.robot)
         self.single_observation_space = observation_space(self._task.simulator)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+import reprlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -96,9 +97,21 @@ def require_frame_steps(simulator: AnySimulator, what: str) -> None:
 def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
     """A start for each of `count` episodes, where one may be given for all. Raises ConfigError for anything but
     Starts."""
-    each = list(starts) if isinstance(starts, Sequence) and not isinstance(starts, str) else [starts] * count
+    several = isinstance(starts, (Sequence, np.ndarray)) and not isinstance(starts, str)
+    each = list(starts) if several else [starts] * count
     others = [start for start in each if not isinstance(start, Start)]
-    require(not others, f"an episode begins at a Start (see the simulator's `starts`), not at {others[:1]}")
+    require(
+        not others, f"an episode begins at a Start (see the simulator's `starts`), not at {reprlib.repr(others[:1])}"
+    )
+    return each
+
+
+def each_action(actions: Actions, count: int) -> list[ArrayLike | None]:
+    """An entry for each of `count` episodes. Raises ConfigError for another number of them."""
+    if not isinstance(actions, Iterable):
+        raise ConfigError(f"{count} episodes need as many actions, got {actions!r}")
+    each = list(actions)
+    require(len(each) == count, f"{count} episodes need as many actions, got {len(each)}")
     return each
 
 

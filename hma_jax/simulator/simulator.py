@@ -27,6 +27,7 @@ from hma_jax.simulator.interface import (
     Actions,
     WholeNumbers,
     chosen_episodes,
+    each_action,
     each_beginning,
     read_only,
     whole_numbers,
@@ -237,10 +238,10 @@ class Simulator:
 
         `clipped` then names, for each episode, the dimensions whose values were outside the range.
         """
-        require(len(actions) == len(self), f"{len(self)} episodes need as many actions, got {len(actions)}")
+        each = each_action(actions, len(self))
         asked: dict[int, np.ndarray] = {}
         clipped: list[tuple[str, ...]] = [()] * len(self)
-        for b, action in enumerate(actions):
+        for b, action in enumerate(each):
             if action is None:
                 continue
             robot = self._running_episode(b).robot

@@ -42,7 +42,7 @@ from hma_jax.config import require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.kernels.random import key_of
 from hma_jax.runtime.files import write_file
-from hma_jax.simulator.interface import AnySimulator
+from hma_jax.simulator.interface import AnySimulator, whole_numbers
 
 DESCRIPTION, WEIGHTS = "head.json", "head.safetensors"
 PIECE = 256
@@ -243,6 +243,9 @@ class HeadJudge:
     keeps separate state for each simulator."""
 
     def __init__(self, head: Head, hold: int = 1):
+        """Raises ConfigError for a number of frames that is none."""
+        [hold] = whole_numbers("hold", [hold])
+        require(hold >= 1, f"hold, the number of frames in a row, must be at least 1, got {hold}")
         self.head, self.hold = head, hold
         self._states: WeakKeyDictionary[AnySimulator, _EpisodeState] = WeakKeyDictionary()
 

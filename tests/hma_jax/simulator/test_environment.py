@@ -83,7 +83,11 @@ def test_an_episode_ends_by_its_judge_or_its_length():
 
 def test_an_episode_is_as_long_as_gymnasium_is_told_and_not_shorter():
     """Also one longer than those that nothing is told of."""
-    for told, longest in (({"max_episode_steps": MAX_STEPS + 1}, MAX_STEPS + 1), ({}, MAX_STEPS)):
+    for told, longest in (
+        ({"max_episode_steps": MAX_STEPS + 1}, MAX_STEPS + 1),
+        ({}, MAX_STEPS),
+        ({"max_episode_steps": None}, MAX_STEPS),
+    ):
         alone, several = (
             made(NAME, simulator=Still(count.get("num_envs", 1)), starts=STARTS, robot="arm", **told, **count)
             for made, count in ((gymnasium.make, {}), (gymnasium.make_vec, {"num_envs": 2}))
@@ -239,6 +243,15 @@ def test_a_part_of_a_vector_begins_anew_where_a_mask_says_so():
 def test_a_vector_of_episodes_without_a_step_is_refused():
     with pytest.raises(ConfigError, match="at least 1 step, got max_episode_steps=0"):
         vector(max_episode_steps=0)
+    with pytest.raises(ConfigError, match=r"max_episode_steps must be whole numbers, got \[2.5\]"):
+        vector(max_episode_steps=2.5)
+
+
+@pytest.mark.parametrize("env", [RobotEnv, RobotVectorEnv])
+def test_a_way_to_be_shown_that_there_is_not_is_refused(env):
+    """Nothing was shown, and nothing said so."""
+    with pytest.raises(ConfigError, match="render_mode: 'human' is not allowed; choose one of None, rgb_array"):
+        env(simulator=Still(1), starts=STARTS, robot="arm", render_mode="human")
 
 
 @pytest.mark.parametrize("start_", ["x", None, 1.5, 3, -1])
@@ -270,6 +283,7 @@ def test_native_actions_are_no_steps_of_an_environment():
     [
         ({"rate": "model", "history": 3}, "rate, history: only for loading a `run`"),
         ({"robot": "base"}, "no start of robot 'base'; there are starts of pusher, arm"),
+        ({"starts": iter(STARTS)}, r"an episode begins at a Start .*, not at \[<"),
         ({"starts": []}, r"there are no starts, so no episode can begin: .*make_simulator\('RUN', episodes=1\)"),
         ({"run": "somewhere"}, "either `run` or `simulator`"),
     ],

@@ -326,7 +326,10 @@ def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
     "deed, message",
     [
         (lambda sim: sim.step([None]), "1 actions|as many actions"),
+        (lambda sim: sim.step(None), "2 episodes need as many actions, got None"),
+        (lambda sim: sim.step(0.5), "2 episodes need as many actions, got 0.5"),
         (lambda sim: sim.step([np.zeros(2), None]), "episode 0 has not begun"),
+        (lambda sim: sim.reset(np.zeros((2, 8, 8, 3), np.uint8)), r"not at \[array\(.{,40}\Z"),
         (
             lambda sim: sim.reset("arm"),
             r"an episode begins at a Start .see the simulator's `starts`., not at \['arm'\]",
@@ -359,6 +362,13 @@ def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
 def test_what_cannot_be_done_is_said(deed, message: str):
     with pytest.raises(ConfigError, match=message):
         deed(simulator(episodes=2))
+
+
+def test_starts_may_be_an_array():
+    """As a random choice of some is."""
+    sim, given = simulator(episodes=2), [start(0, 1), start(1, 1)]
+    want = sim.reset(given)
+    np.testing.assert_array_equal(sim.reset(np.array(given)), want)
 
 
 def test_a_history_of_fewer_frames_than_none_is_refused():

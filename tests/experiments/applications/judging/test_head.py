@@ -8,6 +8,7 @@ import pytest
 from experiments.applications.judging import head as of_head
 from experiments.applications.judging.head import (
     HeadConfig,
+    HeadJudge,
     SuccessHead,
     fit_heads,
     init_head,
@@ -66,6 +67,13 @@ def test_a_head_is_read_as_it_was_written_and_refused_where_its_description_lack
         (tmp_path / "head/head.json").write_text(damaged)
         with pytest.raises(ConfigError, match="head.json does not say all of config, measured; train it again"):
             load_head(where)
+
+
+@pytest.mark.parametrize(("hold", "message"), [(0, "must be at least 1, got 0"), (1.5, r"whole numbers, got \[1.5\]")])
+def test_a_judge_waits_for_one_or_more_frames_with_success(hold, message):
+    """With 0 every episode ended at once."""
+    with pytest.raises(ConfigError, match=message):
+        HeadJudge(SuccessHead(CONFIG, {}), hold)
 
 
 def test_frames_with_success_weigh_as_much_together_as_those_without(monkeypatch):
