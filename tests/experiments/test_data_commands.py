@@ -6,11 +6,20 @@ import json
 
 import pytest
 
+from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry import table as registry_table
+from data_pipelines.registry.toml_file import to_toml
 from data_pipelines.tokens.store import TokenStore
 from experiments.cli.main import main
 from tests.data_pipelines.convert.sources import hand, write_epic, write_lerobot, write_robomimic
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.data_pipelines.tokens.test_import_tokens import write_folder
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    monkeypatch.setattr(registry_table, "_registered", {})
+
 
 FORMATS = ("robomimic", "lerobot", "epic-kitchens", "ego4d", "egoexo4d")
 
@@ -61,6 +70,19 @@ def test_an_export_says_what_it_wrote_and_what_is_lacking(tmp_path, capsys):
     assert main(["data", "inspect", str(tmp_path / "new"), "--out", str(tmp_path / "seen")]) == 0
     assert main([*command, "--hz", "5"]) == 2 and "with other settings" in capsys.readouterr().err
     assert main([*command, "--hz", "0"]) == 2 and "--hz must be positive and finite" in capsys.readouterr().err
+
+
+def test_an_export_is_at_the_rate_of_the_registry_entry(tmp_path, capsys):
+    """By which the dataset is viewed and tokenised too; the rate of its files was taken without a word."""
+    place, entry = write_robomimic(tmp_path / "image.hdf5"), tmp_path / "mine.toml"
+    entry.write_text(to_toml(DatasetSpec("robomimic_lift", "observation/agentview", ("action",), (7,), 15)))
+    command = ["data", "export", str(place), "--registry", str(entry), "--out", str(tmp_path / "new")]
+    assert main(command) == 0
+    out = said(capsys)
+    assert (
+        "note: its files say 20 Hz, but its registry entry 15 Hz, which is used" in out and "16 frames at 15 Hz" in out
+    )
+    assert json.loads((tmp_path / "new" / "meta" / "info.json").read_text())["fps"] == 15
 
 
 def test_an_export_leaves_out_as_many_damaged_episodes_as_there_are(tmp_path, capsys):

@@ -36,7 +36,7 @@ def data_export(
         source: The dataset: an RLDS directory, such as `hma generate` writes, or a robomimic file.
         out: Directory of the new dataset.
         split: The split to read; several are joined by +.
-        hz: Frames per second. Default: what the files say, or else the dataset's registry entry.
+        hz: Frames per second. Default: those of the dataset's registry entry, or else what the files say.
         action: Fields that make up the action, such as action/joints action/gripper or action[:7]. Default: those of
             the registry entry, or else the field `action`, or all of action/* except flags that end an episode.
         state: Fields that make up observation.state. Default: observation/state or observation/proprio.
@@ -46,14 +46,17 @@ def data_export(
     from data_pipelines.export.fields import choose_fields
     from data_pipelines.export.lerobot import export_lerobot
     from data_pipelines.sources.open import open_source
+    from data_pipelines.sources.source import same_rate
 
     require_local("--out", out)
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
     use_entries(registry)
     opened = open_source(source, split, corrupt="skip" if skip_damaged else "raise", max_skipped=sys.maxsize)
     entry = find_reader(opened.name)
-    rate = hz or opened.hz or (entry.hz if entry else None)
+    rate = hz or (entry.hz if entry else opened.hz)
     require(rate is not None, f"{source}: its files do not say how many frames a second it has; give --hz")
+    if hz is None and opened.hz is not None and not same_rate(opened.hz, rate):
+        say(f"note: its files say {opened.hz:g} Hz, but its registry entry {rate:g} Hz, which is used; --hz is another")
     fields = choose_fields(opened, action or (entry.action_keys if entry else ()), state)
     with step(f"write {counted(len(opened), 'episode')} of {opened.name}") as update:
         try:
