@@ -107,6 +107,13 @@ def test_the_entry_can_be_pasted_and_reads_the_dataset(tmp_path, capsys):
     RldsDataset(tmp_path / "my_robot").check_keys(spec.image_key, spec.action_keys, spec.action_dims)
 
 
+def test_a_conversion_from_the_cache_of_hugging_face_is_called_by_the_repository(tmp_path, capsys):
+    """As the same folder is called where it is read in place; it was called by its revision."""
+    root = write_lerobot(tmp_path / "datasets--lab--pour-cup" / "snapshots" / "0a1b2c3d", "v3.0")
+    assert main(["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]) == 0
+    assert f"wrote {tmp_path}/pour_cup/1.0.0" in said(capsys)
+
+
 def test_episodes_that_the_meta_folder_has_lost_are_left_out_on_request(tmp_path, capsys):
     root = write_lerobot(tmp_path / "arm", "v2.1", lengths=(12, 9, 7))
     path = root / "meta" / "episodes.jsonl"

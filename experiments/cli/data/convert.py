@@ -73,9 +73,10 @@ def lerobot(
         settings: What is taken from the dataset.
     """
     from data_pipelines.sources.lerobot import LeRobotSource
+    from data_pipelines.sources.lerobot_dataset import lerobot_name
 
     opened = LeRobotSource(source, settings, may_lose=destination.skip_damaged)
-    _convert(opened, destination, source.absolute().name, opened.unsupported_images)
+    _convert(opened, destination, destination.name or lerobot_name(source), opened.unsupported_images)
 
 
 def epic_kitchens(
