@@ -47,6 +47,7 @@ from experiments.applications.policies.tasks import Task, find_task
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import make_once, write_table
+from experiments.running.workspace import Workspace
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import step, wrote
@@ -267,8 +268,9 @@ def compare_in_run(
     for policy in policies:
         require_choice(policy, POLICIES, "--policies")
     settings = Settings(steps=steps, starts=starts, demonstrations=demonstrations, predicts=predicts, limits=limits)
-    write_results(compare(run, out, settings, policies), out)
-    wrote(out / "trials.csv", out / "summary.csv", out / "table.md")
+    with Workspace(out).locked():
+        write_results(compare(run, out, settings, policies), out)
+        wrote(out / "trials.csv", out / "summary.csv", out / "table.md")
 
 
 def main() -> None:

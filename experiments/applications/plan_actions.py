@@ -54,6 +54,7 @@ from experiments.applications.policies.tasks import Task, find_task, held, world
 from experiments.applications.settings_file import pin_settings
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import make_once, write_table
+from experiments.running.workspace import Workspace
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote
@@ -339,8 +340,9 @@ def plan_in_run(
         search=SearchConfig(candidates=candidates, iterations=iterations),
         seed=seed,
     )
-    write_results(compare(run, out, settings, ways), out)
-    wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
+    with Workspace(out).locked():
+        write_results(compare(run, out, settings, ways), out)
+        wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
 
 
 def main() -> None:

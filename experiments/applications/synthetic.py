@@ -360,32 +360,33 @@ def compare_in_run(
         through_tokenizer=through_tokenizer,
         temperature=temperature,
     )
-    simulator = load_simulator(
-        run, own_starts=True, episodes=BATCH, decode=change_decode(find_decode(run), temperature), history=1
-    )
-    source = make_source(run, training, demonstrations, simulator)  # a mistyped name claims nothing
-    second = out / SECOND
-    require(
-        bool(without_actions) or not second.exists(),
-        f"{second} shows that --out already has policies of a model without actions: give --without-actions again, or "
-        "another --out",
-    )
-    settings = source.settings
-    passive = load_passive(without_actions, source.robot, simulator.decode) if without_actions else None
-    require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
-    pin_settings(out, run, simulator, settings, may_differ=("seeds",))
-    if passive:
-        pin_settings(out, without_actions, passive, file=SECOND)
-    data = make_data(source, simulator, out, passive)
-    through = simulator.tokenizer if settings.through_tokenizer else None
-    seen = reconstruct_recorded(data, through, settings.given) if through else data
-    trials = run_trials(source, seen, out / "trials", through)
-    written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
-    write_settings(out, run, simulator, settings)
-    shortest = data["recorded"].lengths[:2].min()
-    kinds = [kind for kind in (*KINDS, PASSIVE_KIND) if kind in data]
-    draw_strips([data[kind].images[:2, :shortest] for kind in kinds], kinds, out / "frames.png")
-    wrote(*written, out / "frames.png")
+    with Workspace(out).locked():
+        simulator = load_simulator(
+            run, own_starts=True, episodes=BATCH, decode=change_decode(find_decode(run), temperature), history=1
+        )
+        source = make_source(run, training, demonstrations, simulator)  # a mistyped name claims nothing
+        second = out / SECOND
+        require(
+            bool(without_actions) or not second.exists(),
+            f"{second} shows that --out already has policies of a model without actions: give --without-actions again, or "
+            "another --out",
+        )
+        settings = source.settings
+        passive = load_passive(without_actions, source.robot, simulator.decode) if without_actions else None
+        require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
+        pin_settings(out, run, simulator, settings, may_differ=("seeds",))
+        if passive:
+            pin_settings(out, without_actions, passive, file=SECOND)
+        data = make_data(source, simulator, out, passive)
+        through = simulator.tokenizer if settings.through_tokenizer else None
+        seen = reconstruct_recorded(data, through, settings.given) if through else data
+        trials = run_trials(source, seen, out / "trials", through)
+        written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
+        write_settings(out, run, simulator, settings)
+        shortest = data["recorded"].lengths[:2].min()
+        kinds = [kind for kind in (*KINDS, PASSIVE_KIND) if kind in data]
+        draw_strips([data[kind].images[:2, :shortest] for kind in kinds], kinds, out / "frames.png")
+        wrote(*written, out / "frames.png")
 
 
 def main() -> None:

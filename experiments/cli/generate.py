@@ -80,6 +80,7 @@ def generate(
         open_trajectories,
     )
     from experiments.applications.simulators import DEAF, load_simulator
+    from hma_jax.runtime.outputs import make_directory
     from hma_jax.simulator.folder import change_decode, find_decode
 
     require_local("--out", out)
@@ -91,6 +92,7 @@ def generate(
     if clips:
         require_module("av", f"--clips {clips}")
     use_entries(registry, run)
+    make_directory(out)
     decode = change_decode(find_decode(run), temperature, unmask_steps=unmask_steps)
     simulator = load_simulator(
         run, own_starts=True, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch,

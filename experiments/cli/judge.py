@@ -96,6 +96,7 @@ def judge(
     from experiments.applications.judging.real import read_real
     from experiments.applications.policies.kinds import KINDS
     from experiments.applications.policies.tasks import ROBOTS, AnyTask, RecordedTask, find_task
+    from experiments.running.workspace import Workspace
     from hma_jax.simulator.robots import require_robot
     from hma_jax.training.runs import load_run
 
@@ -125,23 +126,24 @@ def judge(
         head_episodes=head_episodes,
     )
     counts = None if real is None else read_real(real)
-    if recordings is None:
-        judged = judge_run(run, out, config, policies)
-    else:
-        use_entries(registry, run)
-        judged = judge_recorded(run, out, config, recordings, policies, split, tuple(counts or ()))
-    ladder = judged.config.ladder
-    trained = {"--demonstrations": judged.config.demonstrations, "--steps": ladder.steps}
-    trained |= {f"--{kind}": n for kind, n in ladder.counts.items()}
-    given: dict[str, Any] = {
-        "--robot": robot, "--task": task if recordings is None else None, "--policies": policies,
-        "--recordings": recordings, "--split": split, "--reward": reward, "--registry": registry, "--real": real,
-        "--starts": judged.config.starts, "--batch": judged.config.batch, "--frames": judged.config.task.frames,
-        "--hold": judged.config.task.hold, **(trained if recordings is None else {}),
-        "--head-episodes": head_episodes, "--head-steps": head_steps, "--seed": seed, "--out": out,
-    }  # fmt: skip
-    words = [x for flag, value in given.items() if value is not None for x in (flag, value)]
-    _write_results(judged, counts, out, command("judge", run, *words))
+    with Workspace(out).locked():
+        if recordings is None:
+            judged = judge_run(run, out, config, policies)
+        else:
+            use_entries(registry, run)
+            judged = judge_recorded(run, out, config, recordings, policies, split, tuple(counts or ()))
+        ladder = judged.config.ladder
+        trained = {"--demonstrations": judged.config.demonstrations, "--steps": ladder.steps}
+        trained |= {f"--{kind}": n for kind, n in ladder.counts.items()}
+        given: dict[str, Any] = {
+            "--robot": robot, "--task": task if recordings is None else None, "--policies": policies,
+            "--recordings": recordings, "--split": split, "--reward": reward, "--registry": registry, "--real": real,
+            "--starts": judged.config.starts, "--batch": judged.config.batch, "--frames": judged.config.task.frames,
+            "--hold": judged.config.task.hold, **(trained if recordings is None else {}),
+            "--head-episodes": head_episodes, "--head-steps": head_steps, "--seed": seed, "--out": out,
+        }  # fmt: skip
+        words = [x for flag, value in given.items() if value is not None for x in (flag, value)]
+        _write_results(judged, counts, out, command("judge", run, *words))
 
 
 def _show_agreement_with_labels(labels: Path, out: Path) -> None:

@@ -337,11 +337,10 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
         monkeypatch.setattr(sys, "argv", [*asked, *more])
         with pytest.raises(ConfigError, match=said):
             synthetic.main()
-        assert not out.exists()
+        assert [path.name for path in out.iterdir()] == [".lock"]
     monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--out", str(out), "--split", "train", "--held-out", "a"])
     with pytest.raises(ConfigError, match="--split, --held-out: only for recordings; give these with --actions"):
         synthetic.main()
-    out.mkdir()
     (out / "without_actions.json").write_text("{}")
     monkeypatch.setattr(sys, "argv", asked[:2] + asked[4:])
     with pytest.raises(
@@ -351,7 +350,7 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
     monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--out", str(tmp_path / "small")])
     with pytest.raises(ConfigError, match="policies and success heads need images of 32 x 32 pixels, but 8 x 8"):
         synthetic.main()
-    assert not (tmp_path / "small").exists()
+    assert [path.name for path in (tmp_path / "small").iterdir()] == [".lock"]
 
 
 def test_episodes_that_leave_nothing_to_generate_or_to_judge_are_refused():
