@@ -118,7 +118,7 @@ def _read_now(path: Path) -> dict[str, Any] | None:
 def _read(path: Path) -> dict[str, Any] | None:
     try:
         return json.loads(path.read_text())
-    except FileNotFoundError:
+    except (FileNotFoundError, ValueError):  # the latter of a file that was cut off by a power loss or in copying
         return None
 
 

@@ -7,8 +7,11 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from experiments.cli.main import main
-from experiments.running.attempts import PROGRESS, STARTED, attempt
+from experiments.running.attempts import FAILURE, PROGRESS, STARTED, attempt
+from experiments.running.ledger import Ledger
 from experiments.running.workspace import Workspace, command_at, save_record
 from tests.experiments.fakes import finished_study, record_of
 
@@ -41,6 +44,18 @@ def test_a_running_trial_says_where_it_is_and_for_how_long_it_said_nothing(tmp_p
         assert f"training 1,200 of 3,000 │ {start['host']} │" in said(capsys, str(tmp_path))
         monkeypatch.setattr("time.time", lambda: (directory / PROGRESS).stat().st_mtime + 600)
         assert f"{start['host']}, 10 min ago" in said(capsys, str(tmp_path))
+
+
+@pytest.mark.parametrize("name", [PROGRESS, FAILURE])
+def test_files_of_an_attempt_that_a_power_loss_emptied_are_not_shown(name, tmp_path: Path, capsys):
+    """The command ended with a traceback."""
+    workspace = finished_study(tmp_path)
+    save_record(workspace, record_of())
+    directory = next(workspace.trials.iterdir())
+    (directory / "result.json").unlink()
+    Ledger(workspace.ledger).append(directory.name, "running")
+    (directory / name).touch()
+    assert "10 of 11 trials finished" in said(capsys, str(tmp_path))
 
 
 def test_a_directory_without_a_study_is_refused(tmp_path: Path, capsys):
