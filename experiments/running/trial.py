@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from experiments.running.provenance import Provenance
 from experiments.running.results_version import OF_SOME
 from hma_jax.config import EvalConfig, ModelConfig, TrainConfig
-from hma_jax.config.base import later
+from hma_jax.config.base import check_fields, later
 from hma_jax.config.json import identity_of, stable_hash, to_dict
 
 if TYPE_CHECKING:
@@ -36,6 +36,9 @@ class Trial:
     capped: tuple[str, ...] = later(())  # datasets to which max_trajectories applies; (): all of them
     # A trained model to which `datasets` are added; only these are then trained. None: a new model.
     source: Trial | None = later(None)
+
+    def __post_init__(self):
+        check_fields(self)
 
     def with_source(self) -> tuple[Trial, ...]:
         """The trials that must have run for this one, and this one."""

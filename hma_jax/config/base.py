@@ -110,8 +110,8 @@ def as_declared(hint: Any, value: Any, where: str, plain: Callable[[Any, Any, st
 
 def as_scalar(hint: type, value: Any, where: str) -> Any:
     """`value` for a field of one of the types `SCALARS`. A NumPy number becomes a Python number. 1000.0 becomes 1000
-    where `hint` is int; 1 stays 1 where `hint` is float. Raises ConfigError, which begins with `where`, for everything
-    else: a bool is not a number, and a number is not a bool."""
+    where `hint` is int, and 1 becomes 1.0 where `hint` is float: equal configurations have one name. Raises
+    ConfigError, which begins with `where`, for everything else: a bool is not a number, and a number is not a bool."""
     given = value
     if getattr(value, "shape", None) == ():
         value = value.item()  # a NumPy number, or an array of one number
@@ -123,7 +123,7 @@ def as_scalar(hint: type, value: Any, where: str) -> Any:
     if isinstance(value, int):
         most = sys.float_info.max if hint is float else sys.maxsize
         require(abs(value) <= most, f"{where}: the number is too large for {hint.__name__}")
-    return value
+    return float(value) if hint is float else value
 
 
 def _as_made(hint: Any, value: Any, where: str) -> Any:

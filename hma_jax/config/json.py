@@ -85,8 +85,8 @@ def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
 def _decode(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_dict(hint, value, where)
-    if hint is float:
-        return float(value if value in INFINITE else as_scalar(float, value, where))
+    if hint is float and value in INFINITE:
+        return float(value)
     return as_scalar(hint, value, where) if hint in SCALARS else value
 
 

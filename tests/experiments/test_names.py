@@ -11,12 +11,12 @@ from experiments.preparing.made_from import read_stamp
 from experiments.preparing.tokenizer import training_settings
 from experiments.presets import CPU_FULL, SMOKE
 from experiments.running import trial as trial_module
-from experiments.running.trial import trial_id
+from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import DiffusionConfig, TokenizerConfig
 from hma_jax.config.base import later
-from hma_jax.config.json import identity_of
+from hma_jax.config.json import from_dict, identity_of, to_dict
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.io import DESCRIPTION, load_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
@@ -118,3 +118,12 @@ def test_a_change_that_alters_some_trials_renames_these_alone(monkeypatch):
     monkeypatch.setattr(trial_module, "OF_SOME", {})
     changed = [name(trial, PROVENANCE) != id for trial, id in zip(trials, before, strict=True)]
     assert changed == [False, True, True, True, True]
+
+
+def test_a_whole_number_is_as_good_as_a_float():
+    """The trial of an axis of one's own ran in a directory whose job.json named another."""
+    one = replace(reference_trial(CPU_FULL, 0), tau=3.0, rate=2.0)
+    whole = replace(one, tau=3, rate=2, model=replace(one.model, mlp_ratio=int(one.model.mlp_ratio)))
+    assert one.model.mlp_ratio.is_integer()
+    name = trial_id.__wrapped__  # what is remembered does not distinguish equal trials
+    assert name(whole, PROVENANCE) == name(from_dict(Trial, to_dict(whole)), PROVENANCE) == name(one, PROVENANCE)

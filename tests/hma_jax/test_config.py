@@ -108,10 +108,10 @@ def test_values_of_another_type_are_refused_when_a_configuration_is_made():
     assert Magvit2Config(image_size=[64.0, np.int64(128)]).image_size == (64, 128)
 
 
-def test_a_whole_number_for_a_float_is_called_as_ever():
-    """Finished trials are named by the text of it: 8.0 would be another."""
-    assert json.dumps(to_dict(MupConfig(attention_scale=8))["attention_scale"]) == "8"
-    assert stable_hash(MupConfig(attention_scale=8)) != stable_hash(MupConfig(attention_scale=8.0))
+def test_a_whole_number_for_a_float_makes_the_same_name_as_the_float():
+    """The two are equal, and a file that is read always gives the float."""
+    assert json.dumps(to_dict(MupConfig(attention_scale=8))["attention_scale"]) == "8.0"
+    assert stable_hash(MupConfig(attention_scale=8)) == stable_hash(MupConfig(attention_scale=8.0))
 
 
 def test_a_whole_number_that_was_written_as_a_float_is_read():
