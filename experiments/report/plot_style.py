@@ -20,7 +20,7 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, NullLocator
 
 from experiments.analysis.intervals import HELD_OUT_LOSS
-from experiments.analysis.rows import OVERALL, CurvePoint, Row, curve, tally
+from experiments.analysis.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve, of_sweep, tally
 from experiments.sweeps.sweep import POINT, Sweep
 from hma_jax.runtime.files import write_file
 
@@ -42,6 +42,9 @@ ON_LOG = ("perplexity", "diffusion_loss")
 EXP_OF = {"perplexity": HELD_OUT_LOSS}
 """{what is drawn: the metric of which it is exp of the mean}. The release's perplexity, which tables have, is a mean of
 exponentials: of a few hard robots, so that it may rank models otherwise than nats do."""
+HIGHEST_DRAWN = 100.0
+"""Nats beyond which a trial's exp is left out of figures: beside it, nothing else on an axis could be told apart, and
+from 710 on a float does not hold it. Chance is about ten."""
 OVER = {False: "seeds and episodes", True: "seeds, each with its own robots"}
 """What the errors of several seeds are taken over, by whether judged robots are drawn anew for every seed."""
 ONE_SEED = "one seed: s.e. over episodes"
@@ -87,9 +90,12 @@ def choose_metrics(measured: list[str], usual: list[str]) -> list[str]:
 def drawn_curve(
     rows: Iterable[Row], sweep: Sweep, metric: str, role: str = POINT, scope: str = OVERALL, series: str = ""
 ) -> list[CurvePoint]:
-    """`curve` of a metric in LABELS, as all figures draw it: bars are `sem`."""
+    """`curve` of a metric in LABELS, as all figures draw it: bars are `sem`. Points with a seed beyond HIGHEST_DRAWN
+    are left out, which `show_tally` says."""
     points = curve(rows, sweep.name, EXP_OF.get(metric, metric), role, scope, series, sweep.robots_vary)
-    return [_exp(p) for p in points] if metric in EXP_OF else points
+    if metric not in EXP_OF:
+        return points
+    return [_exp(p) for p in points if not any(loss > HIGHEST_DRAWN for loss in p.seeds.values())]
 
 
 def _exp(p: CurvePoint) -> CurvePoint:
@@ -235,9 +241,14 @@ def show_control(panel: Axes, points: list[CurvePoint], series: str = "") -> Non
         )  # fmt: skip
 
 
-def show_tally(panel: Axes, rows: Iterable[Row], sweep: str) -> None:
+def show_tally(panel: Axes, rows: Sequence[Row], sweep: str) -> None:
     finished, total = tally(rows, sweep)
-    panel.set_title(f"{finished} of {total} trials", loc="right", fontsize=8.5, color=MUTED)
+    judged = [
+        r for r in of_sweep(rows, sweep) if (r.metric, r.scope) == (HELD_OUT_LOSS, OVERALL) and r.role != UNTRAINED
+    ]
+    high = {(r.trial, r.x) for r in judged if r.mean > HIGHEST_DRAWN}
+    left_out = f", perplexity of {len(high)} too high to draw" if high else ""
+    panel.set_title(f"{finished} of {total} trials{left_out}", loc="right", fontsize=8.5, color=MUTED)
 
 
 def show_legend(figure: plt.Figure, panels: Iterable[Axes]) -> None:

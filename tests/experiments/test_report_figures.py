@@ -15,7 +15,7 @@ from experiments.analysis.isoflop import Budget, IsoFlop
 from experiments.analysis.rows import TRAINING, TRAINING_LOSS, Row, curve
 from experiments.analysis.scaling import Curve, CurveFit
 from experiments.presets import CPU_FULL
-from experiments.report import plot_fits
+from experiments.report import plot_fits, plots
 from experiments.report.fits import describe_fits, with_constant
 from experiments.report.pieces import pm
 from experiments.report.plot_families import plot_family
@@ -28,6 +28,7 @@ from experiments.sweeps.conditioning import plan as plan_conditioning
 from experiments.sweeps.episodes import plan as plan_episodes
 from experiments.sweeps.lr_horizon import plan as plan_lr_horizon
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, unique_trials
+from experiments.sweeps.width import plan as plan_width
 from tests.experiments.analysis.curves import measured, power, sizes
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, windows_of
@@ -162,6 +163,22 @@ def test_a_caption_lies_within_its_figure(plan, metrics):
     assert 0 < box.x0 and box.x1 < figure.bbox.width and "one seed, over episodes" in caption_of(figure)
 
 
+@pytest.mark.parametrize("others", [4.0, 2.7e18])
+@pytest.mark.parametrize("plan", [plan_width, plan_lr_horizon, plan_conditioning])
+def test_a_loss_whose_exp_no_float_holds_is_left_out_of_figures_which_say_so(plan, others, tmp_path, monkeypatch):
+    """Of a learning rate that is far too high: finite in nats. It kept the whole study from having a page."""
+    sweep, kept = plan(CPU_FULL), []
+    worst = max(p.x for p in sweep.points)
+    rows = rows_of(sweep, lambda p: {"cross_entropy": 800.0 if p.x == worst else others})
+    monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))
+    plots.plot_sweep(rows, sweep, tmp_path / "figure.png")
+    kept[0].canvas.draw()
+    high = len({(r.trial, r.x) for r in rows if r.mean > 100})
+    (tally,) = {title for panel in kept[0].axes if (title := panel.get_title(loc="right"))}
+    assert tally.endswith(f" trials, perplexity of {high} too high to draw")
+    plt.close(kept[0])
+
+
 def test_errors_of_tables_without_episodes_are_said_to_be_over_windows():
     """Earlier versions counted none."""
     sweep = plan_conditioning(CPU_FULL)
@@ -198,9 +215,7 @@ def test_several_curves_are_shown_with_their_controls():
 
 
 def test_a_curve_s_table_has_its_controls():
-    from experiments.sweeps.width import plan
-
-    sweep = plan(CPU_FULL)
+    sweep = plan_width(CPU_FULL)
     said = describe(sweep, rows_of(sweep, lambda _: {"cross_entropy": 4.0}))
     assert all(
         f"<th scope=row class=text>{p.x:,}, shuffled actions</th>" in said for p in sweep.points if p.role == CONTROL
