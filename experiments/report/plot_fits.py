@@ -105,13 +105,19 @@ def _draw_outcome(panel: Axes, outcome: Outcome, line: np.ndarray, fitted: float
     values = np.array([p.mean, p.low, p.high, math.nan if observed is None else observed])
     mean, low, high, came = values if fitted is None else 100 * np.log(values / fitted)
     panel.errorbar(
-        p.x[0] * (line[-1] / line[0]) ** ASIDE, mean, [[mean - low], [high - mean]], fmt="_", color=DEFAULT, capsize=4,
+        p.x[0] * (line[-1] / line[0]) ** ASIDE, mean, _bar(mean, low, high), fmt="_", color=DEFAULT, capsize=4,
         markersize=9, elinewidth=1.6, zorder=5, label="predicted before it ran",
     )  # fmt: skip
     if observed is not None:
         panel.plot(
             p.x[0], came, "*", color=INK, markersize=9, markerfacecolor="white", zorder=4, label="observed"
         )  # fmt: skip
+
+
+def _bar(value: float, low: float, high: float) -> list[list[float]]:
+    """The lengths of an error bar below and above. An end of an interval of bootstraps may be beyond the value, if only
+    by rounding where all of them are equal: there is no bar on that side."""
+    return [[max(value - low, 0.0)], [max(high - value, 0.0)]]
 
 
 def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
@@ -136,8 +142,8 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
                     markerfacecolor=filling, zorder=4,
                 )  # fmt: skip
                 right.errorbar(
-                    budget.flops, best.value, [[best.value - best.low], [best.high - best.value]], **style,
-                    markerfacecolor=filling, capsize=3,
+                    budget.flops, best.value, _bar(best.value, best.low, best.high), **style, markerfacecolor=filling,
+                    capsize=3,
                 )  # fmt: skip
                 right.plot(budget.flops, budget.near.value, "x", color=colour, markersize=6, zorder=4)
         if isoflop.exponent:

@@ -318,6 +318,19 @@ def test_crosses_are_named_where_no_law_is_drawn_whose_legend_does(tmp_path, mon
     assert kept[0].get_supxlabel() == "crosses: by three sizes"
 
 
+@pytest.mark.parametrize("low", [1e4 + 1e-10, 1.1e4])
+def test_an_interval_that_does_not_hold_its_value_is_drawn(low, tmp_path):
+    """By rounding with one seed and one held-out episode, where all bootstraps are equal: no page was written."""
+    best = Coefficient("N_opt", 1e4, low, 1.2e4)
+    budget = Budget(1e12, np.array([9e3, 1e4, 2e4]), np.array([4.0, 3.9, 4.0]), np.ones(3), 9.2, best, best)
+    plot_fits.plot_isoflop(IsoFlop((budget,), refused="1 of 1 budgets"), tmp_path / "isoflop.png")
+    points = measured(sizes(6), power(sizes(6), 2.0, (1.0, 0.5)), 1e-3, 3, np.random.default_rng(0))
+    predicted = SimpleNamespace(curve="width", x=(1e5,), mean=2.3, low=2.3 * low / 1e4, high=2.8)
+    outcome = SimpleNamespace(prediction=predicted, observed=None)
+    plot_fits.plot_fits([curve_fit(fit_power(points, 5), points)], [outcome], tmp_path / "fits.png")
+    assert {path.name for path in tmp_path.iterdir()} == {"isoflop.png", "fits.png"}
+
+
 APART = Coefficient("difference", 0.19, 0.1, 0.3)
 
 
