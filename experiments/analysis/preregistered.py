@@ -103,7 +103,9 @@ def read_expected(path: Path) -> list[Expected]:
             )
             # A difference in the other direction is the same number.
             positions = frozenset(map(_position, (e.x, e.against)))
-            require(len(positions) > 1, f"{where}: x must name a point, and against, if given, another point")
+            require(
+                bool(e.x) and len(positions) > 1, f"{where}: x must name a point, and against, if given, another point"
+            )
             require(e.metric in METRICS, f"{where}: no metric {e.metric!r}; known: {', '.join(METRICS)}")
             first = lines.setdefault((e.sweep, e.series, positions, e.metric, frozenset(e.seeds)), number)
             require(

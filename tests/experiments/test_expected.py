@@ -171,6 +171,7 @@ def test_a_study_reads_what_is_expected_before_it_prepares_anything(tmp_path, mo
         ("width,,8,,cross_entropy,7,4,inf,abc", "line 2: low and high must be finite"),
         ("width,,8,8.0,cross_entropy,0,-1,1,abc", "line 2: x must name a point, and against, .* another point"),
         ("width,,,,cross_entropy,5,4,6,abc", "line 2: x must name a point"),
+        ("width,,,8,cross_entropy,0,-1,1,abc", "line 2: x must name a point"),  # was open for ever
         ("width,,8,,cross-entropy,5,4,6,abc", "line 2: no metric 'cross-entropy'; known: cross_entropy"),
         ("width,,8,,loss,5,4,6,abc", "line 2: no metric 'loss'"),  # not over judged robots
     ],
