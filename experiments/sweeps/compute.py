@@ -11,7 +11,9 @@ Expected outcome: at each budget one width is best, and at a larger budget a wid
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count
 
 from experiments.running.trial import Trial
 from experiments.study import Study
@@ -34,20 +36,16 @@ def plan(study: Study) -> Sweep:
         """A run that only warms up, or whose learning rate does not decay, is of no use for a comparison."""
         return fewest > study.train.optimizer.warmup_steps and decay_fits(study.train.optimizer, fewest)
 
+    names = name_budgets([b for b in budgets.values() if compares(round(b / largest))])
+
     def point(width: int, budget: float, seed: int) -> Point:
         steps = max(round(budget / flops[width]), 1)
         trial = reference_trial(study, seed, steps)
         if width != study.model.width:
             trial = replace(of_width(trial, width), measure_untrained=False)
-        return Point(width, trial, series=f"{budget:.2g} FLOP")
+        return Point(width, trial, series=names[budget])
 
-    points = [
-        point(width, budget, seed)
-        for budget in budgets.values()
-        if compares(round(budget / largest))
-        for width in widths
-        for seed in study.seeds
-    ]
+    points = [point(width, budget, seed) for budget in names for width in widths for seed in study.seeds]
     require(
         bool(points),
         f"designs.compute {study.designs.compute}: at none of these steps' FLOPs the widest model, of {widths[-1]}, trains "
@@ -66,6 +64,12 @@ def plan(study: Study) -> Sweep:
         title="Equal compute",
         interior_minimum=True,
     )
+
+
+def name_budgets(budgets: Sequence[float]) -> dict[float, str]:
+    """The names of distinct budgets in FLOPs, with two digits or as many as tell them apart."""
+    named = ({budget: f"{budget:.{digits}g} FLOP" for budget in budgets} for digits in count(2))
+    return next(names for names in named if len({*names.values()}) == len(names))
 
 
 def of_width(trial: Trial, width: int) -> Trial:

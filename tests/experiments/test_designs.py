@@ -155,6 +155,12 @@ def test_every_width_spends_the_same_compute():
         assert max(spent) < 1.01 * min(spent)
 
 
+def test_budgets_of_compute_that_agree_in_two_digits_are_told_apart_by_more():
+    """They were refused as two points at one place, with advice for an author of axes."""
+    (sweep,) = plan_sweeps(override(CPU_FULL, ["designs.compute=500,510,1000"]), ("compute",))
+    assert {p.series for p in sweep.points} == {"1.61e+12 FLOP", "1.64e+12 FLOP", "3.22e+12 FLOP"}
+
+
 def test_the_surface_over_size_and_data_has_every_width():
     """The reference, which is judged under more actions, too."""
     surface = surface_of(list(SWEEPS.values()), PROVENANCE)
