@@ -58,19 +58,26 @@ def compare(a: Side, b: Side) -> list[Difference]:
 
     Metrics of tokens are left out if the tokenizers are known to differ, since nats then measure different things.
     Retrieval is left out if the two sides ranked the true actions among different numbers of others. Raises
-    NotComparable, naming the first window that differs, and NoNumbers, naming the first window that lacks a number
-    which every sound model has.
+    NotComparable, naming the first window that differs, or the metrics of both if none of them can be compared, and
+    NoNumbers, naming the first window that lacks a number which every sound model has.
     """
     pairs = _pairs(a, b)
     first = pairs[0][0]
     robots = require_same_windows(first, pairs[0][1])
     shared = [m for m in first.metrics if all(m in table.metrics for pair in pairs for table in pair)]
-    foreign = set(OF_TOKENS if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer else ())
+    other_tokens = a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer
+    foreign = set(OF_TOKENS if other_tokens else ())
     if not all(_same_chance(*pair, robots) for pair in pairs):
         foreign |= {m for m in shared if m.startswith("retrieval")}
     found = []
     for metric in nats_first(m for m in shared if m not in (*foreign, *OF_WINDOWS)):
         found += _of_metric(metric, *_panels((a, b), pairs, metric, robots))
+    if not found:
+        of_a, of_b = (", ".join(m for m in table.metrics if m not in OF_WINDOWS) or "none" for table in pairs[0])
+        why = f"; nats are not compared, since the tokenizers differ ({a.tokenizer}, {b.tokenizer})"
+        raise NotComparable(
+            f"no metric can be compared: {a.name} has {of_a}, {b.name} has {of_b}{why if other_tokens else ''}"
+        )
     return found
 
 

@@ -33,7 +33,8 @@ def compare(
 
     Prints A - B with standard errors, per robot and overall, nats per token first, and writes every metric with
     its 95 % interval. Differences are paired window by window. Standard errors are over episodes and, between studies
-    of several seeds, also over seeds. Ends with exit code 2 if the two were not evaluated on the same windows.
+    of several seeds, also over seeds. Ends with exit code 2 if the two were not evaluated on the same windows, or
+    have no metric in common.
 
     Args:
         a: Directory of a finished trial, of an evaluated model, or of a study.
@@ -84,7 +85,7 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
     """What the errors include, whose training differs, and which seeds, robots and metrics were not compared."""
     from experiments.analysis.compare import other_sequences
 
-    seeds = max((row.seeds for row in rows), default=1)
+    seeds = max(row.seeds for row in rows)
     over = f" and over {seeds} seeds" if seeds > 1 else ""
     caption = f"Differences with standard errors over episodes{over}, window by window."
     for side, other in ((a, b), (b, a)):

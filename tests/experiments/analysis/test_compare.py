@@ -47,6 +47,19 @@ def test_what_windows_alone_decide_is_not_compared():
     assert "lpips" in metrics and "lpips_copy" not in metrics
 
 
+@pytest.mark.parametrize(("tokenizer", "metric", "said"), [
+    ("t", "action_error", "a has cross_entropy, .*, b has action_error$"),
+    ("other", "cross_entropy", r".*, b has cross_entropy; nats are not compared, .* differ \(t, other\)"),
+])  # fmt: skip
+def test_two_models_without_a_metric_in_common_are_refused(tokenizer, metric, said):
+    """As a policy beside a model of frames: they were an empty table, and no error."""
+    a, b = sides()
+    table = b.seeds[0]
+    table = replace(table, metrics={metric: np.ones(len(table)), "psnr_copy": table.metrics["psnr_copy"]})
+    with pytest.raises(NotComparable, match=f"no metric can be compared: {said}"):
+        compare(a, replace(b, seeds={0: table}, tokenizer=tokenizer))
+
+
 def test_what_some_robots_have_not_is_over_the_others():
     rows = {(r.scope, r.metric): r for r in compare(*sides())}
     assert ("r0", "action_nats") not in rows and rows[OVERALL, "action_nats"].n == 2 * 48
