@@ -162,6 +162,10 @@ class _Writer:
         listed = [row for table in self._listed(EPISODE, "tasks", NUMBER, END) for row in table.to_pylist()]
         self._episodes, self._files = len(listed), sum(1 for _ in self._tables())
         self._frames, self._following = (listed[-1][END], listed[-1][NUMBER] + 1) if listed else (0, 0)
+        written = {row[NUMBER] for row in listed}
+        for i in range(self._following):
+            if i not in written:
+                source.skip(i, EpisodeError(f"{source.name}, episode {i}: it was left out before the interruption."))
         self._tasks = {text: i for i, text in enumerate(dict.fromkeys(text for row in listed for text in row["tasks"]))}
         self._shapes: dict[str, tuple[int, ...]] = {}  # camera -> shape of its frames
         self._dtypes: dict[str, str] = {}

@@ -203,6 +203,22 @@ def test_a_damaged_episode_stops_the_export_or_is_left_out(tmp_path):
     assert json.loads((tmp_path / "new" / ORIGIN).read_text())["left_out"] == 1
 
 
+def test_episodes_that_were_left_out_before_an_interruption_count(tmp_path):
+    """With the limit reached, the same command again got further."""
+
+    def change(e: int, features: dict) -> None:
+        if e in (1, 3, 5):
+            features["steps/action"][0] = np.nan
+
+    place = write_rlds(tmp_path, make_spec(), [2] * 7, change=change)
+    for _ in range(3):
+        with pytest.raises(DataError, match="3 episodes cannot be used, more than max_skipped=2"):
+            one_per_file(open_source(place, corrupt="skip", max_skipped=2), tmp_path / "new")
+    with pytest.raises(EpisodeError, match="toy, episode 1: it was left out before"):
+        one_per_file(open_source(place), tmp_path / "new")
+    assert one_per_file(open_source(place, corrupt="skip"), tmp_path / "new") == Exported(4, 8, 3)
+
+
 def test_frames_of_two_sizes_are_refused(tmp_path):
     def change(e: int, features: dict) -> None:
         if e == 1:
