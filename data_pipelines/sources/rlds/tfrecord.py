@@ -23,7 +23,7 @@ from typing import IO, TYPE_CHECKING
 import google_crc32c
 import numpy as np
 
-from data_pipelines.errors import CorruptRecordError, UnreachableError
+from data_pipelines.errors import CorruptRecordError, DataError, UnreachableError
 from data_pipelines.sources.rlds.location import Descriptor, RandomAccessFile, is_remote, open_random_access
 from hma_jax.runtime.files import naming
 
@@ -41,6 +41,9 @@ CHUNK = 4 * 2**20
 
 BLOCK = 4096
 """Smallest read in bytes: the bytes asked for next are usually among them."""
+
+COMPRESSED = (b"\x1f\x8b", b"\x78\x01", b"\x78\x9c", b"\x78\xda")
+"""How a file begins that TensorFlow wrote with compression GZIP or ZLIB."""
 
 SMALL, SCAN_BLOCK = 4096, 65536
 """A scan reads through records of up to SMALL bytes in blocks of SCAN_BLOCK, and skips larger ones."""
@@ -77,8 +80,8 @@ def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
     It stops where a header's checksum is wrong or the file ends inside a record: the offset of the next record is then
     unknown, so records before it are indexed and the rest of the file is not. Payload checksums are verified by
     `read_record`. A file of 0 bytes has 0 records. A file that cannot be read raises UnreachableError, which is not
-    damage. The scan reads block by block: a block holds many records if they are small, little more than a header if
-    they are large.
+    damage; a compressed one raises DataError. The scan reads block by block: a block holds many records if they are
+    small, little more than a header if they are large.
     """
     offsets: list[int] = []
     lengths: list[int] = []
@@ -97,6 +100,11 @@ def scan_shard(path: Location) -> tuple[ShardIndex, CorruptRecordError | None]:
                 break
             length, crc = struct.unpack("<QI", header)
             if masked_crc32c(header[:8]) != crc:
+                if not offset and header[:2] in COMPRESSED:
+                    raise DataError(
+                        f"{path}: it is compressed with GZIP or ZLIB, so single records cannot be read. Write it again "
+                        "without compression, under the same name (GZIP: gunzip < OLD > NEW)."
+                    )
                 reason = "the checksum of the record's length does not match"
                 damage = CorruptRecordError(path, offset, reason)
                 break

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import gzip
 import pickle
+import zlib
 
 import numpy as np
 import pytest
 
-from data_pipelines.errors import CorruptRecordError, DataError
+from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
 from data_pipelines.sources.rlds.tfrecord import HEADER, read_record, scan_shard, write_shard
 from tests.data_pipelines.fakes import REAL_DATA
 from tests.data_pipelines.shards import index_shard
@@ -66,6 +68,17 @@ def test_flipped_bit_in_a_length_is_found_by_the_index(shard):
         index_shard(shard)
     index, damage = scan_shard(shard)
     assert len(index) == 1 and damage.offset == 21
+
+
+@pytest.mark.parametrize("compress", [gzip.compress, zlib.compress])
+def test_a_compressed_shard_is_no_damage(shard, compress):
+    """Downloading it again, as was advised, would give the same bytes."""
+    shard.write_bytes(compress(shard.read_bytes()))
+    with pytest.raises(
+        DataError, match="toy.tfrecord: it is compressed with GZIP or ZLIB.*without compression"
+    ) as raised:
+        scan_shard(shard)
+    assert not isinstance(raised.value, EpisodeError)
 
 
 @pytest.mark.parametrize("byte", [37 + HEADER + 9, 37 + HEADER + len(RECORDS[2]) + 1])  # data, its checksum
