@@ -13,7 +13,7 @@ from data_pipelines.registry import find_spec
 from experiments.presets import get_preset
 from experiments.terminal.command_line import Commands
 from experiments.terminal.progress import say, wrote
-from hma_jax.config import DecodeConfig, Dtype, SamplerConfig, Weights
+from hma_jax.config import DecodeConfig, Dtype, Weights
 from hma_jax.config.evaluation import SamplerKind
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ other frames."""
 SWAPPED = ("ego4d",)
 """Datasets whose images the release trained on with red and blue swapped (reference section 5.5)."""
 
-PLAIN = DecodeConfig(sampler=SamplerConfig(temperature=0.0))
+PLAIN = DecodeConfig()
 """How exported programs fill frames where decode.json leaves it open: as in evaluation, without noise."""
 
 

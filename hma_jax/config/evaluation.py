@@ -45,6 +45,11 @@ class SamplerConfig:
         )
 
     @property
+    def greedy(self) -> bool:
+        """Whether nothing is random in what is drawn."""
+        return self.temperature == 0 and self.scale_initial_noise
+
+    @property
     def noisy_steps(self) -> bool:
         """Whether the steps after the first need random numbers."""
         return self._stochastic and self.temperature > 0
@@ -60,14 +65,15 @@ class DecodeConfig:
 
     `temperature` divides the logits of discrete tokens; 0 takes the most likely entry of each
     factor. DIFFERS: the release divides probabilities by it, which has no effect, since drawing renormalises them
-    (reference section 3.2). Continuous tokens use the `sampler` and its temperature.
+    (reference section 3.2). Continuous tokens use the `sampler` and its temperature, which is the same unless a sampler
+    is given; `sampler` is never None once this exists.
     """
 
     unmask_steps: int = 2  # M: unmasking steps per frame
     temperature: float = 0.0  # sampling temperature of ids; 0: the most likely ones
     top_k: int = 0  # sample only from the k most likely entries of each factor; 0: from all
     order: Literal["random", "confidence"] = "random"  # order in which tokens are unmasked
-    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    sampler: SamplerConfig | None = None  # what draws latents; null: ddpm in 100 steps, at the temperature above
     resample: bool = False  # models on latents: predict every patch again in each unmasking step, as released
     # How to continue after the window of T frames: `exact` computes the window again for every frame;
     # `streaming` reuses keys and values from when the frames had other positions, an approximation.
@@ -78,6 +84,13 @@ class DecodeConfig:
         require(self.unmask_steps >= 1, f"decode.unmask_steps must be at least 1, got {self.unmask_steps}")
         require(self.temperature >= 0, f"decode.temperature must not be negative, got {self.temperature}")
         require(self.top_k >= 0, f"decode.top_k must not be negative, got {self.top_k}")
+        if self.sampler is None:
+            object.__setattr__(self, "sampler", SamplerConfig(temperature=self.temperature))
+
+    @property
+    def greedy(self) -> bool:
+        """Whether ids are the most likely ones. The order in which they are unmasked is random all the same."""
+        return self.temperature == 0
 
 
 @dataclass(frozen=True)
@@ -89,8 +102,7 @@ class EvalConfig:
     # release's evaluation) always the recorded ones.
     context: Literal["generated", "recorded"] = "generated"
     prompt_frames: int = 4  # recorded frames at the beginning of a window
-    # Continuous tokens: the mean of each diffusion step, not a draw.
-    decode: DecodeConfig = field(default_factory=lambda: DecodeConfig(sampler=SamplerConfig(temperature=0.0)))
+    decode: DecodeConfig = field(default_factory=DecodeConfig)
     random_actions: int = 5  # random action sequences for delta PSNR
     # Action sequences of other episodes that the true actions are compared with; 0: no action-nats and no retrieval.
     other_actions: int = 15

@@ -69,10 +69,14 @@ def find_starts(directory: Path) -> tuple[Start, ...]:
 
 def find_decode(directory: Path) -> DecodeConfig:
     """The settings in decode.json. Fields that it leaves out are as in DEFAULT_DECODE or, for fields that may be newer
-    than the file (`hma_jax.config.base.later`), have the value from before. Raises ConfigError for a damaged file."""
+    than the file (`hma_jax.config.base.later`), have the value from before; a `temperature` alone is also that of the
+    sampler. Raises ConfigError for a damaged file."""
     path = directory / DECODE
     stated = completed(_read(path), DEFAULT_DECODE) if path.exists() else {}
-    return from_dict(DecodeConfig, _completed(to_dict(DEFAULT_DECODE), stated), str(path))
+    usual = to_dict(DEFAULT_DECODE)
+    if isinstance(stated, dict) and "temperature" in stated:
+        usual["sampler"]["temperature"] = stated["temperature"]
+    return from_dict(DecodeConfig, _completed(usual, stated), str(path))
 
 
 def _completed(usual: Any, stated: Any) -> Any:

@@ -151,6 +151,8 @@ def test_a_temperature_is_that_of_token_ids_and_of_latents():
     latents = replace(DEFAULT_DECODE.sampler, temperature=0.7)
     assert warm == replace(DEFAULT_DECODE, unmask_steps=5, temperature=0.7, sampler=latents)
     assert change_decode(DEFAULT_DECODE) == DEFAULT_DECODE
+    for temperature in (0.0, 0.7):
+        assert DecodeConfig(temperature=temperature).sampler == SamplerConfig(temperature=temperature)
 
 
 def test_without_a_file_frames_are_decoded_greedily_as_they_are_judged(tmp_path):

@@ -89,5 +89,5 @@ def find_policy(directory: Path, name: str, robot: Robot, simulator: Simulator) 
     if name == RANDOM:
         return RandomPolicy(robot)
     if name == OWN_HEAD:
-        return OwnHeadPolicy(simulator.model, simulator.tokenizer, robot)
+        return OwnHeadPolicy(simulator.model, simulator.tokenizer, robot, simulator.decode)
     return load_policy(directory / name)

@@ -49,7 +49,7 @@ class LearnedModel:
         """Raises ConfigError for a simulator of native actions."""
         require_frame_steps(simulator, "planning")
         self._simulator, self._robot, self._seed = simulator, robot, seed
-        self._greedy = not simulator.tokenizer.channels and simulator.decode.temperature == 0
+        self._greedy = (simulator.decode.sampler if simulator.tokenizer.channels else simulator.decode).greedy
         self._present = None
         self._warned = False
 

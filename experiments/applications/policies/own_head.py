@@ -14,6 +14,7 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.protocol import predicts_actions
 from hma_jax.generation import predict_next_actions
 from hma_jax.kernels.random import key_of
+from hma_jax.simulator.folder import DEFAULT_DECODE
 from hma_jax.simulator.interface import WholeNumbers
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.base import Tokenizer
@@ -23,8 +24,9 @@ from hma_jax.training.runs import Model
 class OwnHeadPolicy:
     """Acts by the action head of a model: gives whole chunks, as the head predicts them, within the robot's range."""
 
-    def __init__(self, model: Model, tokenizer: Tokenizer, robot: Robot):
-        """Raises ConfigError for a model that predicts no actions."""
+    def __init__(self, model: Model, tokenizer: Tokenizer, robot: Robot, decode: DecodeConfig = DEFAULT_DECODE):
+        """The sampler of `decode` draws the actions of a model on latents; one on ids draws nothing. Raises ConfigError
+        for a model that predicts no actions."""
         setting = model.run.train.masking.setting
         require(
             predicts_actions(model.config, setting) and setting != "inverse",
@@ -36,8 +38,6 @@ class OwnHeadPolicy:
         self._embodiment, self._params, self._counts = model.table.index(robot.name), model.params, Counts()
         self._tokens: list[list[np.ndarray]] = []  # frames of each episode, at most T
         self._chunks: list[list[np.ndarray]] = []  # actions between them
-
-        decode = DecodeConfig()
 
         def predict(params, frames, actions_BTU, embodiment_B, seed_B):
             keys = jax.vmap(key_of)(seed_B)

@@ -264,9 +264,9 @@ def test_native_actions_are_no_frames_of_a_plan():
 class Recorder:
     """A simulator of two episodes that keeps what it was reset to, and shows black images."""
 
-    def __init__(self, temperature: float = 0.7):
+    def __init__(self, temperature: float = 0.7, channels: int = 0):
         self.decode, self.asked = DecodeConfig(temperature=temperature), []
-        self.tokenizer = SimpleNamespace(channels=0, image_size=32)
+        self.tokenizer = SimpleNamespace(channels=channels, image_size=32)
 
     def __len__(self) -> int:
         return 2
@@ -310,10 +310,10 @@ def test_observed_actions_outside_the_range_are_said_once(caplog):
     assert caplog.text.count("r: observed action 0 of 99 to 99 is outside the range") == 1
 
 
-@pytest.mark.parametrize("temperature", [0.7, 0.0])
-def test_every_search_and_every_start_samples_with_its_own_numbers(temperature):
+@pytest.mark.parametrize(("temperature", "channels"), [(0.7, 0), (0.0, 0), (0.7, 4), (0.0, 4)])
+def test_every_search_and_every_start_samples_with_its_own_numbers(temperature, channels):
     """A greedy model is one function of frames and actions, the order of unmasking included."""
-    simulator, robot = Recorder(temperature), Robot("pusher_sand", 1, (-8.8, -8.8), (8.8, 8.8), (0.0, 0.0))
+    simulator, robot = Recorder(temperature, channels), Robot("pusher_sand", 1, (-8.8, -8.8), (8.8, 8.8), (0.0, 0.0))
     settings = Settings(frames=11, hold=6, search=SearchConfig(candidates=4, iterations=1))
     for seed in start_seeds(settings.make_task(), 2).tolist():
         plan_actions.run_planner("MPPI in the model", simulator, robot, settings, seed)

@@ -80,11 +80,11 @@ def test_other_decode_settings_and_other_ranges_of_the_same_weights_are_refused(
 
 
 def test_how_latents_are_sampled_counts_in_models_on_latents_alone(tmp_path):
-    run, sampled = Path("runs/model"), DecodeConfig(8, temperature=0.7, sampler=SamplerConfig(temperature=0.7))
+    run, sampled = Path("runs/model"), DecodeConfig(8, temperature=0.7, sampler=SamplerConfig(temperature=1.0))
     for channels in (0, 4):
         pin_settings(tmp_path / str(channels), run, simulator(channels=channels), SETTINGS)
     pin_settings(tmp_path / "0", run, simulator(decode=sampled), SETTINGS)
-    with pytest.raises(ConfigError, match="simulator.decode.sampler.temperature: 1.0 -> 0.7"):
+    with pytest.raises(ConfigError, match="simulator.decode.sampler.temperature: 0.7 -> 1.0"):
         pin_settings(tmp_path / "4", run, simulator(decode=sampled, channels=4), SETTINGS)
 
 

@@ -26,7 +26,7 @@ from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.config.base import later
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.simulator import folder
-from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode, save_decode, save_robots
+from hma_jax.simulator.folder import DEFAULT_DECODE, change_decode, find_decode, save_decode, save_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 from tests.experiments.applications.runs import TABLE, make_run
@@ -105,6 +105,8 @@ def test_a_decoding_that_is_written_by_hand_says_only_what_differs(tmp_path):
     (written,) = re.findall(r"^```json\n(.*?)^```", (DOCS / "simulator.md").read_text(), re.MULTILINE | re.DOTALL)
     for text, meant in (
         (written, replace(DEFAULT_DECODE, unmask_steps=8, temperature=0.0)),
+        ('{"unmask_steps": 8, "temperature": 0.7}', change_decode(DEFAULT_DECODE, 0.7, unmask_steps=8)),
+        ('{"temperature": 0.7, "sampler": {"temperature": 0}}', replace(DEFAULT_DECODE, temperature=0.7)),
         ('{"sampler": {"eta": 0}}', replace(DEFAULT_DECODE, sampler=replace(DEFAULT_DECODE.sampler, eta=0.0))),
     ):
         (tmp_path / "decode.json").write_text(text)

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from hma_jax.config import DecodeConfig, ExecutionConfig, TokenizerConfig, TrainConfig
+from hma_jax.config import (
+    DecodeConfig,
+    DiffusionConfig,
+    ExecutionConfig,
+    PixelsConfig,
+    TokenizerConfig,
+    TrainConfig,
+)
+from hma_jax.model.hma import declare_model
 from hma_jax.simulator import Robot, Simulator, Start
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
+from hma_jax.tokenizers.pixels import PixelTokenizer
 from hma_jax.training.runs import Model, Run
 from tests.tiny import SMALLER, TABLE, lively_params, model_config
 
@@ -25,6 +35,17 @@ def parts() -> tuple[Model, LfqTokenizer]:
     tokenizer = LfqTokenizer(TOKENIZER, declare_tokenizer(TOKENIZER).init(0))
     declared, params = lively_params(CONFIG, scale=0.8)
     run = Run(CONFIG, TrainConfig(), TABLE, params, 7, {"tokenizer": tokenizer.identity})
+    return Model(run, declared, ExecutionConfig()), tokenizer
+
+
+@lru_cache
+def latent_parts() -> tuple[Model, PixelTokenizer]:
+    """The same robots and images, and a model on latents."""
+    tokenizer = PixelTokenizer(PixelsConfig(image_size=8, patch=4))
+    config = replace(CONFIG, diffusion=DiffusionConfig(channels=3, patch=4, width=16, depth=1, steps=20))
+    declared = declare_model(config, TABLE)
+    params = declared.init(0)
+    run = Run(config, TrainConfig(), TABLE, params, 7, {"tokenizer": tokenizer.identity})
     return Model(run, declared, ExecutionConfig()), tokenizer
 
 

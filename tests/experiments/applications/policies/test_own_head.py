@@ -7,7 +7,8 @@ import pytest
 
 from experiments.applications.policies.own_head import OwnHeadPolicy
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
-from tests.hma_jax.simulator.small import ROBOTS, parts
+from hma_jax.simulator.folder import DEFAULT_DECODE, change_decode
+from tests.hma_jax.simulator.small import ROBOTS, latent_parts, parts
 
 
 def test_it_acts_longer_than_its_window_and_then_sees_only_the_last_frames():
@@ -33,6 +34,17 @@ def test_it_acts_longer_than_its_window_and_then_sees_only_the_last_frames():
     again = policy.act(np.stack([frames[0, 0], frames[0, 1]]))
     np.testing.assert_allclose(again[0], acted[0, 0], rtol=1e-5)
     assert not np.array_equal(again[1], acted[0, 1])
+
+
+def test_a_model_on_latents_acts_greedily():
+    """Its actions were draws, whatever the decoding said, and a noising process of less than 100 steps was an error."""
+    model, tokenizer = latent_parts()
+    model = replace(model, run=replace(model.run, train=TrainConfig(masking=MaskingConfig(setting="policy"))))
+    images = np.full((3, 8, 8, 3), 99, np.uint8)
+    for decode, kinds in (((), 1), ((change_decode(DEFAULT_DECODE, temperature=1.0),), 3)):
+        policy = OwnHeadPolicy(model, tokenizer, ROBOTS[1], *decode)
+        policy.reset(seeds=[0, 1, 2])
+        assert len(np.unique(policy.act(images), axis=0)) == kinds
 
 
 @pytest.mark.parametrize(("heads", "setting"), [(False, "full"), (True, "forward"), (True, "inverse")])
