@@ -70,6 +70,10 @@ class _Task:
             "max_steps" not in options,
             "max_steps is not an option: set the length of an episode with Gymnasium's max_episode_steps",
         )
+        require(
+            "episodes" not in options,
+            "episodes is not an option: gymnasium.make makes one, gymnasium.make_vec as many as num_envs",
+        )
         told = ", ".join(options)
         require(
             run is not None or not options, f"{told}: only for loading a `run`; a given `simulator` is used unchanged"

@@ -75,21 +75,13 @@ class Simulator:
         their range are clipped (reported in `clipped`, and logged once per robot) or refused."""
         config = model.config
         require_frames(model.run, "show")
-        [episodes], [history] = whole_numbers("episodes", [episodes]), whole_numbers("history", [history])
-        require(episodes >= 1, f"a simulator needs at least 1 episode, got {episodes}")
-        require(history >= 0, f"history, the number of frames that can be rewound, must not be negative, got {history}")
-        require_choice(outside, get_args(Outside), "outside")
-        require_choice(rate, get_args(Rate), "rate")
+        episodes, history = _checked(episodes, history, decode, outside, rate)
         require(
             config.frames >= 3,
             f"a simulator needs a model with model.frames of at least 3, this one has {config.frames}",
         )
         differs = token_mismatch(config, tokenizer)
         require(not differs, differs)
-        require(
-            decode is None or isinstance(decode, DecodeConfig),
-            f"decode must be a DecodeConfig, got {type(decode).__name__}",
-        )
         Simulator.made_in = Simulator.made_in or os.getpid()
         self.model, self.tokenizer, self.decode = model, tokenizer, decode or DEFAULT_DECODE
         self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
@@ -111,22 +103,36 @@ class Simulator:
         *,
         execution: ExecutionConfig = ExecutionConfig(),
         weights: Weights = "auto",
-        **options: Any,
+        robots: Sequence[Robot] | None = None,
+        starts: Sequence[Start] | None = None,
+        episodes: int = 1,
+        decode: DecodeConfig | None = None,
+        outside: Outside = "clip",
+        rate: Rate = "model",
+        history: int = HISTORY,
     ) -> Simulator:
         """Loads the simulator of a training run, with the files beside it (`folder`).
 
-        `options` are those of the constructor and override these files; an option that is None counts as not given.
-        Robots that are not given are as the files describe them.
+        `robots`, `starts` and `decode` override these files; robots that are not given are as the files describe them.
+        The constructor says what all options from `robots` on mean.
 
         Raises ConfigError if there is no run, if it predicts no frames, or if the tokenizer is not the one with which
         it was trained.
         """
         run = Path(run)
+        episodes, history = _checked(episodes, history, decode, outside, rate)  # loading takes long
         model = load_model(run, execution, weights)
-        given = {name: value for name, value in options.items() if value is not None}
-        found = {"starts": find_starts(run), "decode": find_decode(run)} | given
-        found["robots"] = (*find_robots(run, model.table), *given.get("robots", ()))  # of equal names the last counts
-        return cls(model, find_tokenizer(run, model.run, Path(tokenizer) if tokenizer else None), **found)
+        return cls(
+            model,
+            find_tokenizer(run, model.run, Path(tokenizer) if tokenizer else None),
+            robots=(*find_robots(run, model.table), *(robots or ())),  # of equal names the last counts
+            starts=find_starts(run) if starts is None else starts,
+            episodes=episodes,
+            decode=find_decode(run) if decode is None else decode,
+            outside=outside,
+            rate=rate,
+            history=history,
+        )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Simulator:
         """Returns this simulator itself: Gymnasium copies the arguments of an environment, model included, whenever it
@@ -404,3 +410,17 @@ class Simulator:
 
     def _copy_state(self, state: Episodes) -> Episodes:
         return self._programs.take(state, np.arange(len(self), dtype=np.int32))
+
+
+def _checked(episodes: int, history: int, decode: DecodeConfig | None, outside: Outside, rate: Rate) -> tuple[int, int]:
+    """(episodes, history). Raises ConfigError for options that no model can have."""
+    [episodes], [history] = whole_numbers("episodes", [episodes]), whole_numbers("history", [history])
+    require(episodes >= 1, f"a simulator needs at least 1 episode, got {episodes}")
+    require(history >= 0, f"history, the number of frames that can be rewound, must not be negative, got {history}")
+    require_choice(outside, get_args(Outside), "outside")
+    require_choice(rate, get_args(Rate), "rate")
+    require(
+        decode is None or isinstance(decode, DecodeConfig),
+        f"decode must be a DecodeConfig, got {type(decode).__name__}",
+    )
+    return episodes, history

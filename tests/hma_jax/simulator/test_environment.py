@@ -285,6 +285,7 @@ def test_native_actions_are_no_steps_of_an_environment():
         ({"robot": "base"}, "no start of robot 'base'; there are starts of pusher, arm"),
         ({"starts": iter(STARTS)}, r"an episode begins at a Start .*, not at \[<"),
         ({"starts": []}, r"there are no starts, so no episode can begin: .*make_simulator\('RUN', episodes=1\)"),
+        ({"episodes": 1}, "episodes is not an option: .* as many as num_envs"),
         ({"run": "somewhere"}, "either `run` or `simulator`"),
     ],
 )

@@ -385,6 +385,15 @@ def test_another_word_is_not_taken_for_the_one_it_resembles(name: str, word: str
         simulator(**{name: word})
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"episodes": 0}, {"history": -1}, {"decode": {}}, {"outside": "raise"}, {"rate": "y"}, {"episode": 2}]
+)
+def test_a_wrong_option_is_refused_before_a_model_is_loaded(tmp_path, wrong):
+    """Loading takes minutes where the model is large; here there is none to load."""
+    with pytest.raises((ConfigError, TypeError), match=next(iter(wrong))[:7]):
+        Simulator.load(tmp_path, **wrong)
+
+
 def test_an_action_of_another_shape_or_that_is_not_finite_is_refused():
     sim = simulator()
     sim.reset(start(1, 1))
