@@ -46,6 +46,8 @@ class Robot:
     recorded: bool = True
 
     def __post_init__(self):
+        for name in ("low", "high", "rest"):
+            object.__setattr__(self, name, tuple(np.asarray(getattr(self, name), float).tolist()))
         require(self.stride >= 1, f"robot {self.name!r}: stride must be at least 1, got {self.stride}")
         require(
             len(self.low) == len(self.high) == len(self.rest),

@@ -5,6 +5,7 @@ import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.model.embodiments import Embodiment
+from hma_jax.simulator.folder import load_robots, save_robots
 from hma_jax.simulator.robots import Robot
 
 
@@ -12,6 +13,14 @@ def test_without_recorded_ends_the_range_is_three_deviations_and_what_never_move
     robot = Robot.of(Embodiment("arm", 3, 2, (1.0, 0.5, 5.0), (0.5, 2.0, 0.0)))
     assert (robot.low, robot.high) == ((-0.5, -5.5, 5.0), (2.5, 6.5, 5.0))
     assert robot.rest == (0.0, 0.0, 5.0) and not robot.recorded and robot.stride == 2
+
+
+def test_a_range_may_be_given_as_arrays(tmp_path):
+    """Two such robots could not be compared, and none could be saved."""
+    given, ends = Robot("arm", 1, np.float32([-1, 0]), [1, 0.5], np.zeros(2)), ((-1.0, 0.0), (1.0, 0.5), (0.0, 0.0))
+    assert given == Robot("arm", 1, *ends) and hash(given) == hash(Robot("arm", 1, *ends))
+    save_robots([given], tmp_path / "robots.json")
+    assert load_robots(tmp_path / "robots.json") == (given,)
 
 
 def test_an_action_to_begin_with_is_zero_or_the_mean_within_the_range():
