@@ -253,5 +253,6 @@ def write_config(model: ModelConfig, table: EmbodimentTable, masking: MaskingCon
     else:
         config |= {"image_vocab_size": model.vocab_size, "factored_vocab_size": model.factor_vocab}
         config["num_factored_vocabs"] = model.factors
+        config["dataloader_apply_corruption"] = masking.max_corrupt_rate > 0
         config["dataloader_mask_ratio_min"] = masking.clean_rate_min
     return config

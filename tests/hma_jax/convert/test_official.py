@@ -23,6 +23,8 @@ from hma_jax.convert import (
     write_neutral,
     write_official,
 )
+from hma_jax.convert.official import official_config as written_config
+from hma_jax.convert.official_config import read_masking
 from hma_jax.convert.table import flat, official_parts
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from hma_jax.model.hma import declare_model
@@ -149,6 +151,17 @@ def test_weights_that_were_changed_in_another_format_do_not_count_as_they_came(t
     assert constant_of(run, "as it came").all()
     biases = {"linear": {**run.params["frame_head"]["linear"], "bias": run.params["frame_head"]["linear"]["bias"] + 1}}
     assert not constant_of(replace(run, params={**run.params, "frame_head": biases}), "changed").any()
+
+
+@pytest.mark.parametrize("corrupted", [False, True])
+@pytest.mark.parametrize("rate", [0.0, 0.1])
+def test_how_ids_were_corrupted_in_further_training_is_written(corrupted: bool, rate: float, tmp_path):
+    """The imported file's word that they are not was kept."""
+    run = read_official(make_checkpoint(tmp_path / "a", DISCRETE, ONE, dataloader_apply_corruption=corrupted))
+    assert bool(run.train.masking.max_corrupt_rate) == corrupted
+    masking = replace(run.train.masking, max_corrupt_rate=rate)
+    further = replace(run, train=replace(run.train, masking=masking))
+    assert read_masking(written_config(further)) == masking
 
 
 @pytest.mark.parametrize("base", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
