@@ -207,6 +207,11 @@ class Study:
         self._check_tokens()
         # Checked here as training checks them, which comes after data and tokenizer were made.
         check_objective(self.model, self.train.masking)
+        rows, columns = self.tokenizer.grid_shape
+        require(
+            not self.train.masking.displaced_past or rows == columns,
+            f"train.masking.displaced_past needs square frames, but the tokenizer makes {rows} x {columns} tokens",
+        )
         check_micro_batches(self.train.batch, self.execution.accumulate)
         check_decoding(self.model, self.eval.decode)  # as evaluation checks it, which comes after training
         self.eval.check_images(self.tokenizer.image_shape)

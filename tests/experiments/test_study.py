@@ -17,7 +17,7 @@ from experiments.study_setup import Preset
 from experiments.sweeps import datasets, trajectories, width
 from experiments.sweeps.sweep import reference_trial, unique_trials
 from experiments.user_input.override import override
-from hma_jax.config import ConfigError, MeshConfig
+from hma_jax.config import ConfigError, MaskingConfig, MeshConfig, PixelsConfig
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.hma import declare_model
 from hma_jax.training.optimizer import learning_rate_multiplier
@@ -165,6 +165,20 @@ def test_model_that_takes_other_tokens_is_told_what_to_set(preset, setting, mess
 def test_a_decoding_that_every_trained_trial_would_fail_at_is_refused(preset, setting, message):
     with pytest.raises(ConfigError, match=message):
         override(get_preset(preset), [setting])
+
+
+def test_no_past_is_displaced_as_if_oblong_frames_were_square():
+    """4 x 9 tokens were taken for 6 x 6."""
+    study = get_preset("smoke-continuous")
+    diffusion = replace(study.model.diffusion, channels=3, patch=8)
+    oblong = replace(
+        study,
+        tokenizer=PixelsConfig(image_size=(32, 72), patch=8),
+        model=replace(study.model, tokens=36, diffusion=diffusion),
+    )
+    masking = MaskingConfig(teacher_forcing=True, displaced_past=0.5)
+    with pytest.raises(ConfigError, match="displaced_past needs square frames, but the tokenizer makes 4 x 9 tokens"):
+        replace(oblong, train=replace(oblong.train, masking=masking))
 
 
 def test_the_seed_of_a_study_s_trials_is_one_of_its_seeds():
