@@ -48,8 +48,8 @@ class Embodiment:
     def __post_init__(self):
         for name in ("mean", "std", "low", "high"):
             values = getattr(self, name)
-            if not isinstance(values, tuple):  # lists and arrays are accepted, but cannot be hashed
-                object.__setattr__(self, name, tuple(np.asarray(values).tolist()))
+            if not isinstance(values, tuple):  # lists, arrays and single numbers are accepted
+                object.__setattr__(self, name, tuple(np.atleast_1d(values).tolist()))
         check_fields(self)
         require(
             len(self.mean) == len(self.std) == self.action_dim,

@@ -219,6 +219,10 @@ def test_lists_are_as_good_as_tuples():
         MupConfig(without=["int"])
 
 
+def test_the_statistics_of_a_single_action_value_may_be_numbers():
+    assert Embodiment("x", 1, 1, np.float32(0.5), 2).mean == Embodiment("x", 1, 1, [0.5], [2]).mean == (0.5,)
+
+
 def test_limits_that_can_work_are_accepted():
     OptimizerConfig(beta1=0.0, final_fraction=0.0, decay_fraction=1.0, weight_decay=0.0)
     OptimizerConfig(schedule="cosine", decay_fraction=0.0)
