@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import append_line, write_file
 
 
 class Journal:
@@ -26,7 +25,4 @@ class Journal:
         return [json.loads(line) for line in whole]
 
     def append(self, values: dict[str, Any]) -> None:
-        with open(self.path, "a") as file:
-            file.write(json.dumps(values) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        append_line(self.path, json.dumps(values))

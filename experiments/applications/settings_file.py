@@ -18,7 +18,7 @@ from experiments.terminal.program import command_line
 from hma_jax.config import require
 from hma_jax.config.json import completed, diff, identity_of, to_dict
 from hma_jax.model.params import Params
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import append_line, write_file
 from hma_jax.simulator.simulator import Simulator
 
 FILE = "settings.json"
@@ -73,8 +73,7 @@ def pin_settings(
         write_settings(out, run, simulator, *settings, file=file)
     began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     start = {"began": began, "command": command_line(), "settings": file, **describe_machine(jax.devices())}
-    with open(out / PROVENANCE, "a") as lines:
-        lines.write(json.dumps(start) + "\n")
+    append_line(out / PROVENANCE, json.dumps(start))
 
 
 def write_settings(out: Path, run: Path, simulator: Simulator, *settings: Any, file: str = FILE) -> None:

@@ -9,7 +9,6 @@ directory (`Workspace.locked`), wherever its trials run: a trial's process repor
 from __future__ import annotations
 
 import json
-import os
 import re
 import time
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from typing import Any
 
 from experiments.running.shared_disk import retry_io
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.files import naming
+from hma_jax.runtime.files import append_line
 
 RUNNING, FINISHED, DIVERGED, FAILED = "running", "finished", "diverged", "failed"
 LOST, PREEMPTED = "lost", "preempted"
@@ -74,14 +73,7 @@ class Ledger:
         if "message" in details:
             details["message"] = name_within(self.path.parent, details["message"])
         line = json.dumps({"time": round(self.clock(), 3), "trial": trial, "event": event, **details})
-        retry_io(self._write, line.encode())
-
-    def _write(self, line: bytes) -> None:
-        with naming(self.path), open(self.path, "ab+") as file:
-            _cut_torn_line(file)
-            file.write(line + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
+        retry_io(append_line, self.path, line)
 
 
 def name_within(root: Path, message: str) -> str:
@@ -90,13 +82,3 @@ def name_within(root: Path, message: str) -> str:
         if place != Path("."):
             message = re.sub(rf"(?<![\w./-]){re.escape(str(place))}/", "", message)
     return message
-
-
-def _cut_torn_line(file: Any) -> None:
-    """Removes what follows the last newline."""
-    size = file.seek(0, os.SEEK_END)
-    file.seek(max(size - 65536, 0))
-    tail = file.read()
-    if tail and not tail.endswith(b"\n"):
-        file.truncate(size - (len(tail) - (tail.rfind(b"\n") + 1)))
-    file.seek(0, os.SEEK_END)

@@ -8,6 +8,7 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from hma_jax.config import ConfigError
 
@@ -81,3 +82,23 @@ def write_file(path: Path | str, data: bytes | str) -> None:
     finally:
         temporary.unlink(missing_ok=True)
     sync(path.parent)
+
+
+def append_line(path: Path, line: str) -> None:
+    """Adds a line to a text file, which is made if it is missing, and waits until it is on disk. A torn last line, which
+    a crash or a full disk left, is removed. One process at a time. Raises OSError."""
+    with naming(path), open(path, "ab+") as file:
+        _cut_torn_line(file)
+        file.write(line.encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _cut_torn_line(file: BinaryIO) -> None:
+    """Removes what follows the last newline."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - 65536, 0))
+    tail = file.read()
+    if tail and not tail.endswith(b"\n"):
+        file.truncate(size - (len(tail) - (tail.rfind(b"\n") + 1)))
+    file.seek(0, os.SEEK_END)

@@ -347,7 +347,7 @@ def test_a_shared_disk_that_does_not_answer_once_stops_no_sweep(tmp_path, monkey
     assert failed and {state.event for state in states.values()} == {"finished"}
 
 
-@pytest.mark.parametrize(("module", "name"), [(ledger, "naming"), (runner, "write_file"), (attempts, "is_alive")])
+@pytest.mark.parametrize(("module", "name"), [(ledger, "append_line"), (runner, "write_file"), (attempts, "is_alive")])
 def test_nor_does_one_that_takes_no_line_job_or_lock_once(tmp_path, monkeypatch, module, name):
     act, failed = getattr(module, name), []
 

@@ -16,6 +16,7 @@ import numpy as np
 import simplejpeg
 
 from data_pipelines.sources.rlds.tfrecord import payload_bytes, write_shard
+from hma_jax.runtime.files import naming
 
 VERSION = "1.0.0"
 JPEG_QUALITY = 95
@@ -163,5 +164,6 @@ def write_info(
     )
     info.set_file_format("tfrecord")
     info.set_splits(tfds.core.splits.SplitDict(facts))
-    info.write_to_directory(directory)
-    features.save_config(str(directory))
+    with naming(directory):
+        info.write_to_directory(directory)
+        features.save_config(str(directory))

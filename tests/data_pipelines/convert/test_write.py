@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import runpy
@@ -117,6 +118,17 @@ def test_stopped_between_the_last_shard_and_the_end(tmp_path, monkeypatch):
             convert(Counting(), tmp_path / "b", "toy", shard_bytes=1)
     assert convert(Counting(), tmp_path / "b", "toy", shard_bytes=1).episodes == whole.episodes
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_a_disk_that_is_full_at_the_end_is_named(tmp_path, monkeypatch):
+    """The error of tfds says no path."""
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tensorflow_datasets.core.DatasetInfo.write_to_directory", full)
+    with pytest.raises(OSError, match=r"No space left on device: '\S+/toy/\.1\.0\.0\.\w+\.partial'"):
+        convert(Counting(), tmp_path, "toy", shard_bytes=1)
 
 
 @pytest.mark.parametrize("name", ["sync_tree", "remove"])

@@ -93,6 +93,8 @@ def test_a_line_of_a_journal_that_a_crash_cut_off_does_not_count(tmp_path):
         assert before.read() == torn, "it was overwritten: killed in that moment, all lines would be lost"
     journal.append({"step": 5})
     assert journal.read() == [{"step": 0}, {"step": 1}, {"step": 5}]
+    with full_disk(), pytest.raises(OSError, match=r"journal\.jsonl'"):
+        journal.append({"step": 6})
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"fingerprint": "other"}'])

@@ -19,6 +19,7 @@ from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.config.base import later
 from hma_jax.config.json import completed, to_dict
 from hma_jax.simulator.robots import Robot
+from tests.full_disk import full_disk
 
 RESULTS = Path(__file__).parents[3] / "experiments" / "results"
 PARAMS = {"trunk": {"w": np.arange(3.0)}}
@@ -65,6 +66,17 @@ def test_every_start_leaves_commit_machine_and_command_beside_the_settings(tmp_p
     assert first["commit"] == git_commit() and first["processor"] and first["settings"] == "settings.json"
     assert second == first | {"began": second["began"]}
     time.strptime(first["began"], "%Y-%m-%dT%H:%M:%SZ")  # raises for another form
+
+
+def test_a_start_that_a_full_disk_cut_off_spoils_no_other(tmp_path):
+    """The next one was appended to its half line."""
+    pin_settings(tmp_path, Path("runs/model"), simulator(), SETTINGS)
+    starts = tmp_path / "provenance.jsonl"
+    with full_disk(), pytest.raises(OSError, match=r"provenance\.jsonl'"):
+        pin_settings(tmp_path, Path("runs/model"), simulator(), SETTINGS)
+    starts.write_bytes(starts.read_bytes() + b'{"began": ')
+    pin_settings(tmp_path, Path("runs/model"), simulator(), SETTINGS)
+    assert ["settings.json"] * 2 == [json.loads(line)["settings"] for line in starts.read_text().splitlines()]
 
 
 def test_other_decode_settings_and_other_ranges_of_the_same_weights_are_refused(tmp_path):
