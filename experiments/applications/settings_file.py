@@ -18,7 +18,7 @@ from experiments.terminal.program import command_line
 from hma_jax.config import require
 from hma_jax.config.json import completed, diff, identity_of, to_dict
 from hma_jax.model.params import Params
-from hma_jax.runtime.files import append_line, write_file
+from hma_jax.runtime.files import append_line, read_json, write_file
 from hma_jax.simulator.simulator import Simulator
 
 FILE = "settings.json"
@@ -52,7 +52,7 @@ def pin_settings(
     """
     path, wanted = out / file, described(run, simulator, *settings)
     if path.exists():
-        known = json.loads(path.read_text())
+        known = read_json(path, "copy it again from where it was made, or choose another --out")
         for part in ({SIMULATOR: {"decode": simulator.decode}}, *settings):
             known = completed(known, part)
         comparable = wanted if SIMULATOR in known else {name: x for name, x in wanted.items() if name != SIMULATOR}

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import read_json, write_file
 
 
 def make_once(path: Path, make: Callable[..., Any], *args: Any) -> Any:
@@ -17,7 +17,7 @@ def make_once(path: Path, make: Callable[..., Any], *args: Any) -> Any:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, json.dumps(make(*args)))
-    return json.loads(path.read_text())
+    return read_json(path, "remove it to have it made again")
 
 
 def write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

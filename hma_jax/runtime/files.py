@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from hma_jax.config import ConfigError
 
@@ -84,9 +85,18 @@ def write_file(path: Path | str, data: bytes | str) -> None:
     sync(path.parent)
 
 
+def read_json(path: Path, advice: str) -> Any:
+    """The content of a JSON file. Raises ConfigError, with `advice`, for a damaged one, such as a copy that was cut
+    off; OSError if it is missing or cannot be read now."""
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ConfigError(f"{path} is damaged ({error}); {advice}") from error
+
+
 def append_line(path: Path, line: str) -> None:
-    """Adds a line to a text file, which is made if it is missing, and waits until it is on disk. A torn last line, which
-    a crash or a full disk left, is removed. One process at a time. Raises OSError."""
+    """Adds a line to a text file, which is made if it is missing, and waits until it is on disk. A torn last line,
+    which a crash or a full disk left, is removed. One process at a time. Raises OSError."""
     with naming(path), open(path, "ab+") as file:
         _cut_torn_line(file)
         file.write(line.encode() + b"\n")

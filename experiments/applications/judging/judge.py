@@ -39,7 +39,7 @@ from experiments.terminal.words import few
 from experiments.user_input.user_file import naming_line
 from hma_jax.config import require
 from hma_jax.evaluation.protocol import predicts_actions
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import read_json, write_file
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
@@ -209,7 +209,7 @@ def _find_head(directory: Path, truth: GroundTruth, simulator: Simulator, user_s
         if not kept.exists():
             directory.mkdir(parents=True, exist_ok=True)
             write_file(kept, json.dumps(truth.measure(user_success, reconstruct), indent=1) + "\n")
-        user_success.measured |= json.loads(kept.read_text())
+        user_success.measured |= read_json(kept, "remove it to have the accuracy measured again")
         return user_success
     if (directory / HEAD_DESCRIPTION).exists():
         return load_head(directory)

@@ -14,6 +14,7 @@ import pytest
 
 from experiments.applications import own_policy
 from experiments.applications.settings_file import hash_of, pin_settings
+from experiments.applications.tables import make_once
 from experiments.running.machine import git_commit
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.config.base import later
@@ -66,6 +67,17 @@ def test_every_start_leaves_commit_machine_and_command_beside_the_settings(tmp_p
     assert first["commit"] == git_commit() and first["processor"] and first["settings"] == "settings.json"
     assert second == first | {"began": second["began"]}
     time.strptime(first["began"], "%Y-%m-%dT%H:%M:%SZ")  # raises for another form
+
+
+def test_a_file_that_was_cut_off_in_copying_is_named(tmp_path):
+    """The command ended with a traceback."""
+    pin_settings(tmp_path, Path("runs/model"), simulator(), SETTINGS)
+    for path in (tmp_path / "settings.json", tmp_path / "outcome.json"):
+        path.write_text('{"run": "mod')
+    with pytest.raises(ConfigError, match=r"/settings\.json is damaged \(.*\); copy it again"):
+        pin_settings(tmp_path, Path("runs/model"), simulator(), SETTINGS)
+    with pytest.raises(ConfigError, match=r"/outcome\.json is damaged \(.*\); remove it"):
+        make_once(tmp_path / "outcome.json", dict)
 
 
 def test_a_start_that_a_full_disk_cut_off_spoils_no_other(tmp_path):
