@@ -56,13 +56,16 @@ class Comparison(NamedTuple):
 def compare(
     directory: Path, recorded: Trajectories, given: int, clips: int, rate: float, progress: Update | None = None
 ) -> Comparison:
-    """Writes `psnr.csv` and the first `clips` episodes as MP4 beside `directory`: recording left, model right."""
+    """Writes `psnr.csv` and the first `clips` episodes as MP4 beside `directory`: recording left, model right.
+    Clips that are there are removed: they may be of a dataset that was removed."""
     rows, home, total = [], directory.parent, len(RldsDataset(directory))
+    for clip in (home / "clips").glob("*.mp4"):
+        clip.unlink()
     for i, pair in enumerate(read_pairs(directory, recorded)):
         still = np.broadcast_to(pair.recorded[given - 1], pair.recorded.shape)
         rows.append((pair.number, psnr_of(pair, given), psnr_of(pair._replace(generated=still), given)))
-        clip = home / "clips" / f"{pair.number:05d}.mp4"
-        if i < clips:  # anew: one that is there may be of a dataset that was removed
+        if i < clips:
+            clip = home / "clips" / f"{pair.number:05d}.mp4"
             clip.parent.mkdir(exist_ok=True)
             write_file(clip, encode_video(np.concatenate([pair.recorded, pair.generated], axis=2), rate))
         if progress:

@@ -405,7 +405,10 @@ def test_generated_frames_and_a_still_are_compared_with_what_was_recorded_after_
     pairs = [comparing.Pair(7, generated, recorded), comparing.Pair(9, recorded, recorded)]
     monkeypatch.setattr(comparing, "RldsDataset", lambda _: pairs)
     monkeypatch.setattr(comparing, "read_pairs", lambda *_: iter(pairs))
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips" / "00001.mp4").touch()  # of another dataset that was here
     found = comparing.compare(tmp_path / "data", None, given=2, clips=0, rate=2.0)
+    assert not list((tmp_path / "clips").iterdir())
     off, still = 20 * np.log10(255 / 5), 20 * np.log10(255 / np.array([10.0, 30.0]))
     assert (found.generated.mean, found.still.mean) == pytest.approx(((off + MAX_PSNR) / 2, still.mean()))
     rows = [line.split(",")[:2] for line in (tmp_path / "psnr.csv").read_text().splitlines()[1:]]
