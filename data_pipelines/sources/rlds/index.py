@@ -198,8 +198,9 @@ def _describe_shard(
 
 
 def _stamp_if_old(shard: Location, stamp: str, began: float) -> str:
-    """`stamp`, or "" for a file so new that a later change might not alter its stamp."""
-    return stamp if is_remote(shard) or int(stamp) / 1e9 < began - MIN_AGE else ""
+    """`stamp`, or "" for a file so new that a later change might not alter its stamp. A time far ahead comes from
+    another clock, or from before this one was corrected."""
+    return stamp if is_remote(shard) or abs(began - int(stamp) / 1e9) > MIN_AGE else ""
 
 
 def _check_not_swapped(

@@ -106,6 +106,14 @@ def test_a_shard_of_this_moment_is_not_trusted(directory, scanned):
     assert scanned == ["00001-of-00004"]
 
 
+def test_a_shard_of_next_month_is_not_scanned_at_every_start(directory, scanned):
+    """As copied from a machine whose clock was ahead."""
+    os.utime(shards(directory)[1], (time.time() + 30 * 86400,) * 2)
+    for _ in range(2):
+        RldsDataset(directory)
+    assert len(scanned) == 4
+
+
 def test_a_damaged_index_is_made_again(directory, scanned):
     expected = RldsDataset(directory).fingerprint()
     path = index_path(directory, "train")
