@@ -59,7 +59,7 @@ def short(path: Path) -> str:
     """A path as a user would write it here."""
     try:
         return str(path.relative_to(Path.cwd()))
-    except ValueError:
+    except (ValueError, FileNotFoundError):  # the latter in a directory that was removed
         return str(path)
 
 

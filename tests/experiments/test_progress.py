@@ -10,7 +10,7 @@ from rich.console import Console
 from experiments.running.attempts import State
 from experiments.running.runner import Job
 from experiments.terminal import progress
-from experiments.terminal.progress import SweepMonitor, say, tidy_table
+from experiments.terminal.progress import SweepMonitor, say, short, tidy_table
 
 METRICS = ("perplexity", "accuracy", "psnr", "ssim", "delta_psnr", "action_nats", "retrieval")
 
@@ -35,6 +35,16 @@ def test_no_cell_is_cut_short_at_any_width(width):
     tables = words.count("dataset")
     assert words.count("my_robot") == tables and (tables == 1) == (width == 200)
     assert said.count("a run") == said.count("a caption") == 1
+
+
+def test_paths_are_shown_in_a_directory_that_was_removed(tmp_path, monkeypatch):
+    """What had been written was called a failure."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    assert short(here / "table.csv") == "table.csv"
+    here.rmdir()
+    assert short(tmp_path / "table.csv") == str(tmp_path / "table.csv")
 
 
 def test_a_name_wider_than_the_terminal_is_folded():
