@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,7 @@ from experiments.running.closure import trace
 from experiments.running.workspace import Record, save_record
 from experiments.study_setup import StudyArguments, make_setup
 from hma_jax.evaluation.statistics import Stat
+from tests import files
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments import fakes
 from tests.experiments.idle import ARM, BASE, SMOKE, idle_training  # noqa: F401
@@ -56,10 +58,7 @@ def out(made, tmp_path) -> Path:
     return shutil.copytree(made[0], tmp_path / "out")
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    """Everything that was made, but for what only a report reads."""
-    files = (p for p in root.rglob("*") if p.is_file() and p.name not in (".lock", ".asked.json", "data.json"))
-    return {str(p.relative_to(root)): p.read_bytes() for p in files}
+contents = partial(files.contents, leaving_out=(".lock", ".asked.json", "data.json"))  # only a report reads these
 
 
 @pytest.fixture

@@ -32,9 +32,9 @@ from experiments.study_setup import StudyArguments, make_setup
 from experiments.terminal.progress import Eta
 from tests.data_pipelines.fakes import FakeTokenizer, write_rlds
 from tests.data_pipelines.tokenizing import tokenize_dataset
-from tests.data_pipelines.tokens.job_process import contents
 from tests.experiments.fakes import STUDY
 from tests.experiments.idle import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
+from tests.files import contents
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from hma_jax.model.frames import mask_cells, patchify, unpatchify
 from hma_jax.objective.diffusion import diffusion_loss
 from hma_jax.objective.process import make_process, sampling_process
 from tests.golden.case import Case, norms
-from tests.golden.discrete import with_frame
+from tests.golden.discrete import applier, with_frame
 from tests.sampling import sample_recorded, trajectory_of
 
 _patchify, _unpatchify, _mask_cells = (
@@ -49,18 +49,6 @@ class Latents:
 
     def cells(self, tokens: np.ndarray) -> jax.Array:
         return _unpatchify(tokens, self.config.patch, self.grid[1])
-
-
-def applier(case: Case):
-    """apply(tokens, masked, actions, robots, hidden=None) -> Outputs, compiled."""
-
-    @jax.jit
-    def apply(params, tokens, masked, actions, robots, hidden):
-        return case.declared.merge(params)(tokens, masked, actions, robots, action_hidden_BT=hidden)
-
-    return lambda tokens, masked, actions, robots, hidden=None: apply(
-        case.params, tokens, masked, actions, robots, hidden
-    )
 
 
 def make_sampler(case: Case, head: Callable, temperature: float, run: Callable = sample_recorded) -> Callable:

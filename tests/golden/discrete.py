@@ -42,13 +42,15 @@ def windows(case: Case, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def applier(case: Case):
-    """apply(ids, masked, actions, robots, hidden=None) -> Outputs, compiled."""
+    """apply(tokens, masked, actions, robots, hidden=None) -> Outputs, compiled."""
 
     @jax.jit
-    def apply(params, ids, masked, actions, robots, hidden):
-        return case.declared.merge(params)(ids, masked, actions, robots, action_hidden_BT=hidden)
+    def apply(params, tokens, masked, actions, robots, hidden):
+        return case.declared.merge(params)(tokens, masked, actions, robots, action_hidden_BT=hidden)
 
-    return lambda ids, masked, actions, robots, hidden=None: apply(case.params, ids, masked, actions, robots, hidden)
+    return lambda tokens, masked, actions, robots, hidden=None: apply(
+        case.params, tokens, masked, actions, robots, hidden
+    )
 
 
 def check_logits(case: Case) -> None:

@@ -12,6 +12,7 @@ from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.continuous import ContinuousTokenizer, make_continuous
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.train import tokenizer_loss
+from tests.hma_jax.pretrained import noise
 
 CONTINUOUS = TokenizerConfig(
     image_size=16, downsample=4, quantise=False, bits=6, channels=16, encoder_blocks=1, decoder_blocks=1
@@ -21,10 +22,6 @@ CONTINUOUS = TokenizerConfig(
 @pytest.fixture(scope="module")
 def continuous():
     return ContinuousTokenizer(CONTINUOUS, declare_tokenizer(CONTINUOUS).init(0), 0.3)
-
-
-def noise(count: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (count, 16, 16, 3), np.uint8)
 
 
 def test_latents_that_cannot_be_decoded_are_refused(continuous):
@@ -45,7 +42,7 @@ def test_half_precision_latents_decode_as_well(continuous):
 
 
 def test_latents_have_unit_deviation_on_the_frames_they_were_measured_on():
-    batches = [noise(8, seed) for seed in range(3)]
+    batches = [noise(8, seed=seed) for seed in range(3)]
     tokenizer = make_continuous(CONTINUOUS, declare_tokenizer(CONTINUOUS).init(0), iter(batches))
     latents = np.concatenate([tokenizer.encode(images) for images in batches])
     assert latents.std() == pytest.approx(1, abs=1e-5) and abs(tokenizer.latent_std - 1) > 0.1

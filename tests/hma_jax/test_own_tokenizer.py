@@ -20,6 +20,7 @@ from hma_jax.runtime.user_code import raising_as_called
 from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer, trust_tokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
 from hma_jax.tokenizers.python import PythonTokenizer, try_out
+from tests.hma_jax.pretrained import noise
 
 PAGE = Path(__file__).parents[2] / "docs" / "own_data.md"
 (COLOURS,) = (x for x in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.M | re.S) if "make_tokenizer" in x)
@@ -88,10 +89,6 @@ def bright(tmp_path) -> Path:
     (folder / "network.py").write_text(NETWORK)
     np.save(folder / "gain.npy", np.float32(2**-7))
     return folder
-
-
-def noise(count: int, size: int) -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 256, (count, size, size, 3), np.uint8)
 
 
 def test_ids_of_the_code_on_the_page(colours):

@@ -32,6 +32,7 @@ from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import CheckpointError, read_description
 from hma_jax.training.runs import describe_run, load_model, load_run, modernise, read_configs
 from hma_jax.training.train import train_model
+from tests.hma_jax.test_training import equal_trees
 from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, lively_params, model_config, train_config
 
 OLD = Path(__file__).parent / "data" / "run_3caafdd.tar.gz"
@@ -58,10 +59,6 @@ def averaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, object]:
     run_dir = tmp_path_factory.mktemp("averaged")
     result = train_model(MODEL, TABLE, AVERAGED, batches(MODEL, 4), run_dir=run_dir, provenance={})
     return run_dir, result.state
-
-
-def equal(a, b) -> bool:
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def replace_checkpoint(old: Path, new: Path) -> None:
@@ -223,7 +220,7 @@ def test_a_model_whose_training_is_not_finished_is_read_with_one_warning(average
 def test_loading_a_model_does_not_read_the_moments(averaged, tmp_path: Path):
     run_dir = shutil.copytree(averaged[0], tmp_path / "run")
     shutil.rmtree(run_dir / "checkpoints" / "2" / "opt_state")
-    assert equal(load_run(run_dir).params, averaged[1].params)
+    assert equal_trees(load_run(run_dir).params, averaged[1].params)
     damaged = next((run_dir / "checkpoints" / "2" / "params").rglob("_METADATA"))
     damaged.write_bytes(damaged.read_bytes()[:-1])
     with pytest.raises(CheckpointError, match="params/_METADATA"):
@@ -239,10 +236,10 @@ def test_a_run_is_read_into_memory_of_the_host(averaged):
 
 def test_which_weights_are_read_is_said_and_can_be_chosen(averaged, old_run: Path):
     run_dir, state = averaged
-    assert not equal(state.ema, state.params)
+    assert not equal_trees(state.ema, state.params)
     for weights, want, which in (("last", "params", "last"), ("ema", "ema", "ema"), ("auto", "ema", "ema")):
         run = load_run(run_dir, weights)
-        assert run.weights == which and equal(run.params, getattr(state, want))
+        assert run.weights == which and equal_trees(run.params, getattr(state, want))
     assert load_run(old_run, "auto").weights == "last"
     with pytest.raises(ConfigError, match="keeps no average of its weights"):
         load_run(old_run, "ema")
@@ -263,7 +260,7 @@ def test_a_run_that_was_shipped_with_its_average_alone_says_so(averaged, tmp_pat
         checkpoints.save(2, Shipped(averaged[1].ema))
     for weights in ("auto", "ema"):
         run = load_run(tmp_path / "run", weights)
-        assert run.weights == "ema" and equal(run.params, averaged[1].ema)
+        assert run.weights == "ema" and equal_trees(run.params, averaged[1].ema)
     with pytest.raises(ConfigError, match="keeps only the average of its weights, not the last ones; use ema"):
         load_run(tmp_path / "run", "last")
 
@@ -330,7 +327,7 @@ def test_a_model_goes_to_another_process_and_is_shown_in_a_few_lines(averaged):
     """Its initialisers cannot be pickled, and its repr had all weights in it."""
     model = load_model(averaged[0], ExecutionConfig("bfloat16"))
     other = pickle.loads(pickle.dumps(model))
-    assert equal(other.params, model.params) and other.execution == model.execution
+    assert equal_trees(other.params, model.params) and other.execution == model.execution
     assert other.run.provenance == model.run.provenance and other.declared is model.declared
     assert len(repr(model)) < 4000 and len({model, other}) == 2
 

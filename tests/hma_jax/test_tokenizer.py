@@ -32,6 +32,7 @@ from hma_jax.tokenizers.quantizer import (
 from hma_jax.tokenizers.train import make_optimizer, tokenizer_loss, train_tokenizer
 from hma_jax.training.checkpoints import CheckpointError
 from hma_jax.training.loop import LoopOptions
+from tests.hma_jax.pretrained import noise
 
 CONFIG = TokenizerConfig(
     image_size=16, downsample=4, bits=6, factors=2, channels=16, encoder_blocks=1, decoder_blocks=1
@@ -57,10 +58,6 @@ def tokenizer(request):
 @pytest.fixture(scope="module")
 def discrete():
     return fresh(CONFIG)
-
-
-def noise(count: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (count, 16, 16, 3), np.uint8)
 
 
 def scenes(count: int, seed: int = 0) -> np.ndarray:

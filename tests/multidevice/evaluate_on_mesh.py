@@ -4,6 +4,7 @@ Prints the number of devices, and how many collectives inside of loops gather pa
 parameters stay as they are stored.
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def main(mesh: str, path: str, stored: str = "") -> None:
     assert seen == [5, 10, 14]
     assert evaluation.samples["arm"]["random"].shape == (1, 6, 8, 8, 3)
     evaluation.windows.save(Path(path), "model")
-    print(jax.device_count(), *gathers)
+    print(json.dumps([jax.device_count(), *gathers]))
 
 
 if __name__ == "__main__":

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hma_jax.evaluation.windows import WindowTable
+from tests.multidevice.run import run_on
 
 
-def run_on(devices: int, mesh: str, path: Path, *stored: str) -> tuple[WindowTable, int]:
+def evaluate_on(devices: int, mesh: str, path: Path, *stored: str) -> tuple[WindowTable, int]:
     """(the windows' numbers, gathers of parameters in loops)"""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.multidevice.evaluate_on_mesh", mesh, str(path), *stored],
-        env=os.environ | {"XLA_FLAGS": flags},
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    there, gathers = map(int, done.stdout.split())
+    there, gathers = run_on(devices, "evaluate_on_mesh", mesh, str(path), *stored)
     assert there == devices
     return WindowTable.load(path), gathers
 
@@ -32,10 +21,10 @@ def run_on(devices: int, mesh: str, path: Path, *stored: str) -> tuple[WindowTab
 @pytest.mark.slow
 def test_numbers_do_not_depend_on_the_number_of_devices(tmp_path: Path):
     """Batches of 5 windows: with 8 devices, padded; in groups of 1 and of 4 windows."""
-    one, _ = run_on(1, "1,1,1", tmp_path / "one.csv.gz")
+    one, _ = evaluate_on(1, "1,1,1", tmp_path / "one.csv.gz")
     # Parameters whole along `fsdp`, or gathered in every pass.
     for mesh, *stored in (("2,2,2",), ("2,2,2", "stored"), ("1,8,1",)):
-        eight, gathers = run_on(8, mesh, tmp_path / "eight.csv.gz", *stored)
+        eight, gathers = evaluate_on(8, mesh, tmp_path / "eight.csv.gz", *stored)
         assert gathers > 0 or not stored
         assert gathers == 0 or mesh != "1,8,1"
         assert eight.names == one.names and len(one) == 14

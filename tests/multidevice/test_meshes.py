@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.multidevice.run import run_on
+
 ONE = "1,1,1"
 MESHES = ("8,1,1", "1,8,1", "1,1,8", "4,2,1", "4,1,2", "2,4,1", "1,4,2", "2,1,4", "1,2,4", "2,2,2")
 """Every factorisation of eight devices."""
-
-
-def run_on(devices: int, program: str, *arguments: str) -> Any:
-    """What a program of this folder prints last."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-    done = subprocess.run(
-        [sys.executable, "-m", f"tests.multidevice.{program}", *arguments],
-        env=os.environ | {"XLA_FLAGS": flags},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 @pytest.fixture(scope="module")

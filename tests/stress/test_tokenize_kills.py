@@ -10,7 +10,7 @@ import pytest
 
 from data_pipelines.registry import get_spec
 from tests.data_pipelines.fakes import write_rlds
-from tests.data_pipelines.tokens.job_process import contents
+from tests.files import contents
 from tests.stress import tokenize_kills
 from tests.stress.tokenize_process import Work, read, tokenize
 

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from data_pipelines.suite.embodiments import select
 from data_pipelines.suite.generate import generate_suite
-from tests.data_pipelines.tokens.job_process import contents
+from tests.files import contents
 from tests.stress.tokenize_process import Work, read, tokenize
 
 DATASETS, EPISODES = 3, 40

@@ -49,10 +49,6 @@ def write_video(path: Path, frames: list[int], fps: int, size=(HEIGHT, WIDTH), t
         container.mux(stream.encode())
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
-
-
 def read_back(directory: Path, image_key: str):
     """Every episode as our own reader sees it, after tfds has accepted the directory and agreed."""
     import tensorflow_datasets as tfds

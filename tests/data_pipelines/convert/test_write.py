@@ -22,7 +22,8 @@ from data_pipelines.sources.convertible import Episode, Layout, Skipped, UnitErr
 from data_pipelines.sources.human import detections
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from hma_jax.config import ConfigError
-from tests.data_pipelines.convert.sources import contents, number, picture, read_back
+from tests.data_pipelines.convert.sources import number, picture, read_back
+from tests.files import contents
 
 PAGE = Path(__file__).parents[3] / "docs" / "own_data.md"
 

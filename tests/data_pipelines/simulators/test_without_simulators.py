@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from data_pipelines.simulators.write import write_dataset
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
+from tests import files
 from tests.data_pipelines.simulators.fakes import EPISODES, SIZE, SPEC, fake_workers, make_episode, write_episode
 from tests.test_packaging import PYPROJECT
 
@@ -182,9 +184,7 @@ def test_text_that_is_no_start_state_is_refused():
         StartState.from_json(b'{"env": "Lift"}')
 
 
-def contents(root) -> dict[str, bytes]:
-    files = (p for p in sorted(root.rglob("*")) if p.is_file() and p.name != "stats.json")
-    return {str(p.relative_to(root)): p.read_bytes() for p in files}
+contents = partial(files.contents, leaving_out=("stats.json",))
 
 
 def run(root, **more):

@@ -33,6 +33,7 @@ from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer
 from tests.data_pipelines.shards import index_shard
 from tests.data_pipelines.tokenizing import tokenize_dataset
+from tests.files import contents
 
 NAMES = ("pusher_mint", "rover_slate", "mobile_sky")
 """Short ones: a single tensor of actions; video alone; dict-valued actions."""
@@ -45,10 +46,6 @@ def suite(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("suite")
     generate_suite(root, **TINY, names=NAMES)
     return root
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -43,11 +43,6 @@ def start(rlds: Path, store: Path, **options) -> multiprocessing.Process:
     return process
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    """Every file of a store, leftovers too."""
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
-
-
 if __name__ == "__main__":
     from hma_jax.tokenizers.io import load_tokenizer
 

@@ -28,7 +28,8 @@ from hma_jax.config import ConfigError
 from hma_jax.config.base import later
 from hma_jax.config.json import identity_of, to_dict
 from tests.data_pipelines.fakes import write_rlds
-from tests.data_pipelines.tokens.job_process import SPEC, contents, run, start
+from tests.data_pipelines.tokens.job_process import SPEC, run, start
+from tests.files import contents
 
 LENGTHS = [8 + i % 5 for i in range(24)]
 

@@ -18,7 +18,8 @@ from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from tests.data_pipelines.fakes import png, write_rlds
-from tests.data_pipelines.tokens.job_process import SPEC, contents
+from tests.data_pipelines.tokens.job_process import SPEC
+from tests.files import contents
 
 CONFIG = TokenizerConfig(image_size=64, downsample=8, channels=32)
 KILLS, EPISODES = 20, 160

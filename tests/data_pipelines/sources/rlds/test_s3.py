@@ -11,6 +11,7 @@ from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 from tests.data_pipelines.tokenizing import tokenize_dataset
+from tests.files import contents
 
 pytest.importorskip("moto")
 s3fs = pytest.importorskip("s3fs")
@@ -45,10 +46,6 @@ def store(server, tmp_path, monkeypatch):
     yield local
     server.tell()
     s3fs.S3FileSystem.clear_instance_cache()
-
-
-def contents(root):
-    return {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
 
 
 @pytest.mark.parametrize("failing", [0.0, 0.1])

@@ -70,6 +70,17 @@ def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, floa
     return mean, half
 
 
+def mean_in(minute: int, of: Mapping[tuple, dict], measure: str) -> float:
+    """The mean of a measure over eight robots in a minute, which is the last part of a row's key."""
+    mean, _, robots = over_robots([row for (*_, at), row in of.items() if at == minute], measure)
+    assert robots == 8
+    return mean
+
+
+def percent_in(minute: int, of: Mapping[tuple, dict], measure: str = "object_found") -> str:
+    return f"{100 * mean_in(minute, of, measure):.0f}"
+
+
 def by_place(name: str, variant: str | None = None) -> dict[tuple, dict]:
     """(robot, start, part) -> row of a committed table, of one variant where it has several."""
     rows = [row for row in read_rows(RESULTS / name) if variant in (None, row["variant"])]

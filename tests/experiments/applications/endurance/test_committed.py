@@ -18,7 +18,9 @@ from tests.experiments.applications.endurance.committed import (
     check_tables,
     gain,
     gains,
+    mean_in,
     of_three_starts,
+    percent_in,
     rows_of_trained,
     words_of,
 )
@@ -41,21 +43,11 @@ def test_ten_minutes_are_as_the_page_says():
     page, mine = words_of(PAGE), {(robot, minute): row for (robot, _, minute), row in by_place("grown_ten.csv").items()}
     small = {(robot, minute): row for (robot, _, minute), row in by_place("endurance.csv").items()}
     assert len(mine) == 8 * 10 and mine.keys() == small.keys()
-
-    def mean(measure: str, minute: int, of: dict = mine) -> float:
-        found, _, robots = over_robots([row for (_, at), row in of.items() if at == minute], measure)
-        assert robots == 8
-        return found
-
-    def objects(of: dict) -> list[str]:
-        return [f"{100 * mean('object_found', minute, of):.0f}" for minute in (1, 2, 10)]
-
-    first, second, last = objects(mine)
+    (first, second, last), before = ([percent_in(minute, of) for minute in (1, 2, 10)] for of in (mine, small))
     said = f"found in {first} % of the frames of the first minute, {second} % of the second and {last} % of the last; small model: "
-    assert said + "{}, {} and {} %.".format(*objects(small)) in page
-    tools = f"{100 * mean('tool_found', 10):.0f}"
-    assert f"Tools are found in {tools} % of the frames of the last minute" in page
-    said = f'"Follows" is {mean("follows", 1):.2f} in the first minute and {mean("follows", 10):.2f} in the last. '
+    assert said + "{}, {} and {} %.".format(*before) in page
+    assert f"Tools are found in {percent_in(10, mine, 'tool_found')} % of the frames of the last minute" in page
+    said = f'"Follows" is {mean_in(1, mine, "follows"):.2f} in the first minute and {mean_in(10, mine, "follows"):.2f} in the last. '
     following = [robot for robot, minute in mine if minute == 1 and mine[robot, 1]["follows"] > 0.5]
     keeping = [robot for robot in following if mine[robot, 10]["follows"] >= mine[robot, 1]["follows"] / 2]
     assert len(following) == 6
@@ -78,8 +70,8 @@ def test_ten_minutes_are_as_the_page_says():
         ("object_found", "objects found by {:+.2f} ± {:.2f}"),
     ):  # fmt: skip
         assert words.format(*gain(measure, change)) in page, measure
-    variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
-    colours = mean("histogram", 1), mean("histogram", 10)
+    variance = sum(mean_in(minute, mine, "variance") for minute in range(2, 11)) / 9
+    colours = mean_in(1, mine, "histogram"), mean_in(10, mine, "histogram")
     assert f"The variance of frames is {variance:.2f} of the true one." in page
     said = "The share of the colour histogram that differs is {:.2f} in the first minute, {:.2f} in the last."
     assert said.format(*colours) in page
@@ -131,12 +123,7 @@ def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
     page = words_of(PAGE)
     ten, grown = by_place("kept_ten.csv"), by_place("grown_ten.csv")
     assert len(ten) == 8 * 10 and ten.keys() == grown.keys()
-
-    def found(minute: int, of: dict) -> str:
-        rows = [row for row in of.values() if row["part"] == minute]
-        return f"{100 * over_robots(rows, 'object_found')[0]:.0f}"
-
-    kept, before = ([found(minute, of) for minute in (1, 2, 10)] for of in (ten, grown))
+    kept, before = ([percent_in(minute, of) for minute in (1, 2, 10)] for of in (ten, grown))
     said = (
         'in {} % of the frames of the first minute, {} % of the second and {} % of the last; "grown": {}, {} and {} %.'
     )

@@ -14,6 +14,8 @@ from tests.experiments.applications.endurance.committed import (
     check_tables,
     gain,
     gains,
+    mean_in,
+    percent_in,
     rows_of_trained,
     words_of,
 )
@@ -157,12 +159,8 @@ def test_a_displaced_past_keeps_objects_for_a_minute_where_tokens_are_drawn():
     weighed, ten = by_place("endurance.csv"), by_place("displaced_ten.csv")
     assert len(weighed) == 8 * 10 and weighed.keys() == ten.keys()
 
-    def found(minute: int, of: dict) -> str:
-        rows = [row for row in of.values() if row["part"] == minute]
-        return f"{100 * over_robots(rows, 'object_found')[0]:.0f}"
-
     said = 'found in {} % of the frames of the first minute ("weighed": {}), {} of the second ({}), {} of the last ({})'
-    assert said.format(*(found(minute, of) for minute in (1, 2, 10) for of in (ten, weighed))) in page
+    assert said.format(*(percent_in(minute, of) for minute in (1, 2, 10) for of in (ten, weighed))) in page
     kept = [[of[robot, 0, 4]["object_found"] for of in (ten, weighed)] for robot in ("pusher_sand", "omni_chalk")]
     assert kept[0][0] > 0.95 and kept[1][0] < 0.05 < 0.95 < kept[1][1]
 
@@ -189,30 +187,21 @@ def test_ten_minutes_are_as_the_page_says():
         for name in ("endurance.csv", "first_ten.csv")
     )
     assert len(mine) == 8 * 10 and mine.keys() == first.keys()
-
-    def mean(measure: str, minute: int, of: dict = mine) -> float:
-        found, _, robots = over_robots([row for (_, at), row in of.items() if at == minute], measure)
-        assert robots == 8
-        return found
-
-    def percent(*where) -> str:
-        return f"{100 * mean(*where):.0f}"
-
-    tools, objects = percent("tool_found", 10), [percent("object_found", minute) for minute in (1, 2, 10)]
+    tools, objects = percent_in(10, mine, "tool_found"), [percent_in(minute, mine) for minute in (1, 2, 10)]
     assert f"Tools are found in {tools} % of the frames of the last minute" in page
     said = '"Follows" is {:.2f} in the first minute and {:.2f} in the last.'
-    assert said.format(mean("follows", 1), mean("follows", 10)) in page
+    assert said.format(mean_in(1, mine, "follows"), mean_in(10, mine, "follows")) in page
     assert (
         f"found in {objects[0]} % of frames of the first minute, in {objects[1]} % of those of the second, in" in page
     )
     assert f"Objects are found in {objects[2]} % of the frames of the last minute" in page
-    variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
+    variance = sum(mean_in(minute, mine, "variance") for minute in range(2, 11)) / 9
     assert f"variance ({variance:.2f} of the truth's)" in page
     level, half, _ = over_robots([row for (_, minute), row in mine.items() if minute > 1], "level")
     assert f"Mean level ({level:.1f} ± {half:.1f} grey levels too high)" in page
-    colours = mean("histogram", 1), mean("histogram", 10)
+    colours = mean_in(1, mine, "histogram"), mean_in(10, mine, "histogram")
     assert "({:.2f} of the histogram differs in the first minute, {:.2f} in the last)".format(*colours) in page
-    before = percent("tool_found", 10, first), percent("object_found", 10, first)
+    before = percent_in(10, first, "tool_found"), percent_in(10, first)
     said = "of the last minute (first model: {} %), objects in {} % ({} %);"
     assert said.format(before[0], objects[2], before[1]) in page
     arm = [each["arm_sand", 10]["follows"] for each in (mine, first)]
