@@ -73,10 +73,13 @@ test-slow: $(VENV)/installed-test
 # constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves. uv installs in a quarter of the
 # time, and knows nothing of pip's own configuration: where uv finds no packages, pip looks for them, and says so. Modules are
 # compiled when they are imported: most never are, and compiling all of them is 40 % of pip's time.
-PINS = $$($(BIN)/python -c 'import sys; print("-c constraints.txt" if sys.version_info[:2] == (3, 11) else "")')
+# The extra `sim` needs an earlier NumPy than the pinned one.
+PINNED = $(if $(filter sim,$(GIVEN)),$(VENV)/constraints.txt,constraints.txt)
+PINS = $$($(BIN)/python -c 'import sys; print("-c $(PINNED)" if sys.version_info[:2] == (3, 11) else "")')
 PIP = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check $(PINS)
 INSTALL = install() { \
 	echo "installing into $(VENV) (a quarter of a minute, longer on a slow line)"; \
+	grep -v ^numpy== constraints.txt >$(VENV)/constraints.txt; \
 	$(PIP) uv && $(BIN)/uv pip install --quiet --python $(BIN)/python $(PINS) -e "$$1" || \
 		{ echo "uv could not install: pip does, which takes longer"; $(PIP) -e "$$1"; }; \
 	}; install
