@@ -3,13 +3,13 @@
 import faulthandler
 import sys
 
-from experiments.terminal.program import is_program, open_closed_output
+from experiments.terminal.program import is_program, prepare_output
 from hma_jax.runtime.exits import exit_of_interrupt, sigterm_as_interrupt
 from hma_jax.runtime.host_memory import collect_rarely, restart_keeping_pages
 
 
 def start() -> None:
-    open_closed_output()
+    prepare_output()
     faulthandler.enable()  # shows what each thread did if a library ends the process by a signal
     own_process = is_program()
     if own_process:

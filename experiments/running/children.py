@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from experiments.running.slots import Slot
-from experiments.terminal.program import open_closed_output
+from experiments.terminal.program import prepare_output
 from hma_jax.config import ConfigError
 from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.host_memory import KEPT_PAGES, collect_rarely, keep_freed_memory
@@ -59,7 +59,7 @@ def child_environment(compile_cache: Path, slot: Slot = Slot(), accelerator: str
 def enter_child(parent: int = 0) -> None:
     """Called first in a child: limits it to its cores, makes it end with its `parent` (0: the one that the environment
     names) and end in good order when it is asked to."""
-    open_closed_output()  # a child has no use for what its parent opened
+    prepare_output()  # a child has no use for what its parent opened
     faulthandler.enable()  # if a library ends the process by a signal, the threads' stacks show which one
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also if a background shell job had it ignored
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # Ray's workers have them blocked

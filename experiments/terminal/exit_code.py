@@ -11,7 +11,7 @@ from contextlib import nullcontext, suppress
 from data_pipelines.errors import DataError, EpisodeError
 from experiments.running.children import plain_messages, silence_background
 from experiments.running.runner import TrialsFailed
-from experiments.terminal.program import open_closed_output
+from experiments.terminal.program import prepare_output
 from experiments.terminal.progress import OUTPUT, errors
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, sigterm_as_interrupt
@@ -42,7 +42,7 @@ def exit_code_of(
     program's, by default those of the process; none may be a path that is not UTF-8. `resumes`: after a stop the same
     command continues where it was; otherwise it begins anew and keeps what `keeps` names. `skipping`: the option that
     leaves out records that cannot be read."""
-    open_closed_output()
+    prepare_output()
     debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if own_process and not debug:
         silence_background()

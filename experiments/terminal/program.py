@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import runpy
@@ -30,11 +31,14 @@ def is_program() -> bool:
     return re.search(rf"(^|[ /]){PROGRAM}$|(^| )-\w*m ?experiments\.[\w.]+$", started) is not None
 
 
-def open_closed_output() -> None:
-    """What is written to standard output or standard error goes nowhere where these are closed, as by `>&-`."""
+def prepare_output() -> None:
+    """What is written to standard output or standard error goes nowhere where these are closed, as by `>&-`. Characters
+    that the locale lacks are printed as `?`: a dash in a table ends no command."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not a notebook's
+        sys.stdout.reconfigure(errors="replace")
 
 
 def command_line() -> str:

@@ -56,6 +56,14 @@ def test_a_process_is_the_programs_own_if_python_was_started_for_it(started, arg
     assert is_program() == program
 
 
+def test_a_dash_that_the_locale_lacks_ends_no_command():
+    """The table of `hma judge` did, after hours."""
+    printing = r"from experiments.terminal.program import prepare_output as p; p(); print('0.1 \u2013 0.2')"
+    environment = os.environ | {"PYTHONIOENCODING": "iso-8859-1"}
+    done = subprocess.run([sys.executable, "-c", printing], env=environment, capture_output=True, check=True)
+    assert done.stdout == b"0.1 ? 0.2\n"
+
+
 @pytest.mark.parametrize(
     ("started", "module", "command"),
     [

@@ -114,6 +114,6 @@ def over_robots(rows: Iterable[Row], name: str) -> tuple[float, float, int]:
 def read_rows(path: Path) -> list[Row]:
     """What `write_rows` wrote."""
     texts = ("variant", "drive", "robot", "kind")
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     return [{name: text if name in texts else float(text) for name, text in row.items()} for row in rows]

@@ -135,7 +135,7 @@ def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
     )
     require(path.is_file(), f"{path}: no such file; give the file that the page {out / 'blind.html'} saved")
     try:
-        saved: dict[str, Any] = json.loads(path.read_text())
+        saved: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         key: dict[str, Any] = json.loads((out / "blind.json").read_text())
         labels = {int(number): bool(value) for number, value in saved["labels"].items()}
         clips: Sequence[Any] = key["clips"]

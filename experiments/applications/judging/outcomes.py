@@ -73,7 +73,7 @@ def write_outcomes(outcomes: Sequence[Outcome], path: Path) -> None:
 def read_outcomes(path: Path) -> list[Outcome]:
     """Reads outcomes. Raises ConfigError for a file that is damaged or something else."""
     try:
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             return [
                 Outcome(policy, int(start), int(number), int(seed), world, judge, success == "1")
                 for policy, start, number, seed, world, judge, success in map(

@@ -77,7 +77,7 @@ def make_app(
     app[SOCKETS], app[REFUSED] = {}, set()
     app.cleanup_ctx.append(lambda app: _manage_sessions(app, simulator, truth, max_acting))
     about = json.dumps(describe(simulator, truth))
-    page = files("experiments.applications.play").joinpath("page.html").read_text()
+    page = files("experiments.applications.play").joinpath("page.html").read_text(encoding="utf-8")
 
     async def show(_: web.Request) -> web.Response:
         return web.Response(text=page, content_type="text/html", headers=HEADERS)

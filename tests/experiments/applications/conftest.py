@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+import locale
 from collections.abc import Iterator
 
 import pytest
@@ -26,3 +27,12 @@ def shared_starts() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulators, "suite_starts", lambda *what, **how: list(simulated(*what, **how)))
         yield
+
+
+@pytest.fixture
+def ascii_locale() -> Iterator[None]:
+    """Files are read and written as ASCII where no encoding is given, as in some clusters' shells."""
+    before = locale.setlocale(locale.LC_CTYPE)
+    locale.setlocale(locale.LC_CTYPE, "C")
+    yield
+    locale.setlocale(locale.LC_CTYPE, before)

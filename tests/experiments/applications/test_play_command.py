@@ -185,6 +185,12 @@ def test_an_output_that_is_closed_is_no_fault_of_host_or_port(monkeypatch, tmp_p
         command.play(tmp_path, visitors=1)
 
 
+@pytest.mark.usefixtures("ascii_locale")
+def test_the_page_is_read_in_any_locale():
+    """The server ended after minutes of compiling, or its page had other characters."""
+    server.make_app(simulator(), no_truth)
+
+
 def test_a_taken_port_is_said_before_anything_is_loaded(monkeypatch, tmp_path, capsys):
     """It was said after minutes of compiling."""
     from experiments.applications import simulators

@@ -264,6 +264,13 @@ def test_outcomes_that_were_cut_short_are_said(tmp_path):
         read_outcomes(path)
 
 
+@pytest.mark.usefixtures("ascii_locale")
+def test_names_of_policies_are_read_in_any_locale(tmp_path):
+    made = [Outcome("größer", 0, 1, 2, TRUE, HEAD, True)]
+    write_outcomes(made, tmp_path / "outcomes.csv")
+    assert read_outcomes(tmp_path / "outcomes.csv") == made
+
+
 def test_the_head_judges_environments_and_forgets_with_them(judged):
     head = load_head(judged[0] / "out" / "head")
     assert set(head.measured) >= {"frame accuracy", "frame AUROC", "episode accuracy"}
