@@ -154,5 +154,5 @@ def check_decoding(model: ModelConfig, decode: DecodeConfig) -> None:
     require(
         steps <= most,
         f"decode.sampler.steps {steps} is more than model.diffusion.steps {most}, the steps of the noising process; "
-        "change one of the two",
+        "change one of the two (of a simulator: sampler.steps in the run's decode.json)",
     )

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal, get_args
 import jax
 import numpy as np
 
-from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, require
+from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, check_decoding, require
 from hma_jax.config.base import require_choice
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
@@ -82,6 +82,7 @@ class Simulator:
         )
         differs = token_mismatch(config, tokenizer)
         require(not differs, differs)
+        check_decoding(config, decode or DEFAULT_DECODE)
         Simulator.made_in = Simulator.made_in or os.getpid()
         self.model, self.tokenizer, self.decode = model, tokenizer, decode or DEFAULT_DECODE
         self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
@@ -339,11 +340,14 @@ class Simulator:
 
     @property
     def _identity(self) -> str:
-        return f"{self.model.identity} {self.tokenizer.identity}"
+        # Past the window the exact way to slide leaves the cache behind, the streaming way continues from it.
+        slide = "" if self.decode.slide == "exact" else f" {self.decode.slide}"
+        return f"{self.model.identity} {self.tokenizer.identity}{slide}"
 
     def restore(self, snapshot: Snapshot) -> np.ndarray:
         """Continues from a snapshot of this simulator, any number of times; the same actions then give the same frames.
-        Raises ConfigError for a snapshot of another model or tokenizer, or of another number of episodes."""
+        Raises ConfigError for a snapshot of another model, tokenizer or `decode.slide`, or of another number of
+        episodes."""
         require(
             isinstance(snapshot, Snapshot), f"restore takes what `snapshot` returned, got {type(snapshot).__name__}"
         )
@@ -353,7 +357,7 @@ class Simulator:
         )
         kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), state) for state in (snapshot.state, self._state)]
         same = snapshot.identity == self._identity and kinds[0] == kinds[1]
-        require(same, "the snapshot is of a simulator of another model or tokenizer")
+        require(same, "the snapshot is of a simulator of another model or tokenizer, or of another decode.slide")
         self._state, self._images = self._copy_state(snapshot.state), snapshot.images
         self._episodes = list(copy.deepcopy(snapshot.episodes))
         return self.images

@@ -17,13 +17,24 @@ from hma_jax.model.hma import declare_model
 from hma_jax.runtime.arrays import write_arrays
 from hma_jax.simulator import Simulator, Start
 from hma_jax.simulator.episode import as_arrays, from_arrays
+from hma_jax.simulator.folder import DEFAULT_DECODE
 from hma_jax.simulator.programs import Programs
 from hma_jax.simulator.starts import load_starts, save_starts
 from hma_jax.simulator.warm_up import sizes, warm_up_more
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.training.runs import Model
-from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, TOKENIZER, chunks_of, parts, simulator, start
+from tests.hma_jax.simulator.small import (
+    CONFIG,
+    DECODE,
+    ROBOTS,
+    TOKENIZER,
+    chunks_of,
+    latent_parts,
+    parts,
+    simulator,
+    start,
+)
 from tests.tiny import TABLE
 
 FRAMES = 7
@@ -186,6 +197,26 @@ def test_a_snapshot_of_a_model_of_the_same_architecture_is_refused(tmp_path):
         for snapshot in (kept, read):
             with pytest.raises(ConfigError, match="another model") if name != "run" else nullcontext():
                 other.restore(snapshot)
+
+
+def test_a_snapshot_of_a_simulator_that_slides_otherwise_is_refused():
+    """Past the window, a streaming simulator went on from a cache that an exact one had left behind."""
+    exact, streaming = simulator(), simulator(decode=STREAMING)
+    exact.reset(start(1, 1))
+    with pytest.raises(ConfigError, match="another decode.slide"):
+        streaming.restore(exact.snapshot())
+    assert streaming.counts == (0,)
+    exact.restore(simulator(decode=replace(DECODE, temperature=0.0)).snapshot())  # it changes no cache
+
+
+def test_a_decoding_that_the_tokens_do_not_have_is_refused_before_an_episode_begins():
+    """It was refused at the first step."""
+    model, tokenizer = latent_parts()
+    with pytest.raises(ConfigError, match="decode.order 'confidence' needs probabilities"):
+        Simulator(model, tokenizer, decode=replace(DEFAULT_DECODE, order="confidence"))
+    few = replace(model.config, diffusion=replace(model.config.diffusion, steps=8))
+    with pytest.raises(ConfigError, match="sampler.steps 12 is more than .* sampler.steps in the run's decode.json"):
+        Simulator(replace(model, run=replace(model.run, model=few)), tokenizer)
 
 
 def test_the_frames_of_a_snapshot_cannot_be_written_to(tmp_path):
