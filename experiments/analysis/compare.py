@@ -30,6 +30,7 @@ class Side:
     of_study: bool = False  # whether `seeds` are the finished ones of a study's reference
     step: int = 0  # step of its training at which it was evaluated; 0: unknown
     steps: int = 0  # planned number of training steps; 0: unknown
+    noising_steps: int = 0  # steps of the noising process of a model on latents; 0: on ids, or unknown
 
 
 @dataclass(frozen=True)
@@ -56,16 +57,16 @@ class Difference:
 def compare(a: Side, b: Side) -> list[Difference]:
     """Every metric, nats first, overall and by robot, for the robots on which both were judged.
 
-    Metrics of tokens are left out if the tokenizers are known to differ, since nats then measure different things.
-    Retrieval is left out if the two sides ranked the true actions among different numbers of others. Raises
-    NotComparable, naming the first window that differs, or the metrics of both if none of them can be compared, and
-    NoNumbers, naming the first window that lacks a number which every sound model has.
+    Metrics of tokens are left out where they measure different things (`of_other_tokens`). Retrieval is left out if the
+    two sides ranked the true actions among different numbers of others. Raises NotComparable, naming the first window
+    that differs, or the metrics of both if none of them can be compared, and NoNumbers, naming the first window that
+    lacks a number which every sound model has.
     """
     pairs = _pairs(a, b)
     first = pairs[0][0]
     robots = require_same_windows(first, pairs[0][1])
     shared = [m for m in first.metrics if all(m in table.metrics for pair in pairs for table in pair)]
-    other_tokens = a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer
+    other_tokens = of_other_tokens(a, b)
     foreign = set(OF_TOKENS if other_tokens else ())
     if not all(_same_chance(*pair, robots) for pair in pairs):
         foreign |= {m for m in shared if m.startswith("retrieval")}
@@ -74,11 +75,22 @@ def compare(a: Side, b: Side) -> list[Difference]:
         found += _of_metric(metric, *_panels((a, b), pairs, metric, robots))
     if not found:
         of_a, of_b = (", ".join(m for m in table.metrics if m not in OF_WINDOWS) or "none" for table in pairs[0])
-        why = f"; nats are not compared, since the tokenizers differ ({a.tokenizer}, {b.tokenizer})"
-        raise NotComparable(
-            f"no metric can be compared: {a.name} has {of_a}, {b.name} has {of_b}{why if other_tokens else ''}"
-        )
+        losses = "losses" if a.noising_steps and b.noising_steps else "nats"
+        why = f"; {losses} are not compared, since {other_tokens}" if other_tokens else ""
+        raise NotComparable(f"no metric can be compared: {a.name} has {of_a}, {b.name} has {of_b}{why}")
     return found
+
+
+def of_other_tokens(a: Side, b: Side) -> str:
+    """Why metrics of tokens are not comparable, as far as the sides say what they were judged on; "" if they are.
+
+    The diffusion loss sums a bound over the steps of a model's own noising process: fewer steps have larger terms.
+    """
+    if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:
+        return f"the tokenizers differ ({a.tokenizer}, {b.tokenizer})"
+    if a.noising_steps and b.noising_steps and a.noising_steps != b.noising_steps:
+        return f"the noising processes have other numbers of steps ({a.noising_steps}, {b.noising_steps})"
+    return ""
 
 
 def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.analysis.compare import Side
-from experiments.preparing.evaluation_stamp import STAMP
+from experiments.preparing.evaluation_stamp import NOISING_STEPS, STAMP
 from experiments.preparing.made_from import read_stamp
 from experiments.running.attempts import RESULT
 from experiments.running.job import trial_in
@@ -70,23 +70,30 @@ def read_side(path: str | Path) -> Side:
                 f"could be compared. Copy it to {workspace.trials} from where the study ran, run `{record.command}`, or "
                 "name two trials; most studies in experiments/results are kept without their trials"
             )
-        steps = reference_trial(record.study, record.study.seeds[0]).train.steps
-        return Side(path.name, seeds, record.provenance.tokenizer, of_study=True, step=steps, steps=steps)
+        trial = reference_trial(record.study, record.study.seeds[0])
+        return Side(path.name, seeds, record.provenance.tokenizer, of_study=True, **_steps_of(trial))
     if (path / RESULT).exists():
         judged = read_trial(path)
-        steps = judged.trial.train.steps
-        return Side(path.name, {judged.seed: judged.windows}, judged.provenance.tokenizer, step=steps, steps=steps)
+        windows = {judged.seed: judged.windows}
+        return Side(path.name, windows, judged.provenance.tokenizer, **_steps_of(judged.trial))
     if (path / FILE).exists():
         tokenizer, recorded = _said_of(path)
-        seed, step, steps = (recorded.get(name) for name in ("seed", "step", "steps"))
+        seed, numbers = recorded.get("seed"), ("step", "steps", NOISING_STEPS)
         windows = {seed or 0: WindowTable.load(path / FILE)}
-        return Side(path.name, windows, tokenizer, says_seed=seed is not None, step=step or 0, steps=steps or 0)
+        steps = {name: recorded[name] for name in numbers if name in recorded}
+        return Side(path.name, windows, tokenizer, says_seed=seed is not None, **steps)
     raise ConfigError(f"{path}: neither a study, nor a finished trial, nor an evaluated model (no {FILE})")
 
 
+def _steps_of(trial: Trial) -> dict[str, int]:
+    """The numbers of steps that a `Side` has of a finished trial."""
+    noising = trial.model.diffusion.steps if trial.model.diffusion else 0
+    return {"step": trial.train.steps, "steps": trial.train.steps, "noising_steps": noising}
+
+
 def _said_of(run: Path) -> tuple[str, dict[str, Any]]:
-    """The identity of the tokenizer on whose tokens a model was evaluated, and the seed, step and number of steps of
-    its training, from the stamp of `hma evaluate`, or else the seed from the run's latest checkpoint; "" and nothing if
+    """The identity of the tokenizer on whose tokens a model was evaluated, and the seed and numbers of steps of its
+    training, from the stamp of `hma evaluate`, or else the seed from the run's latest checkpoint; "" and nothing if
     neither says it."""
     from hma_jax.training.reading import list_steps, read_description
 

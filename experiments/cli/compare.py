@@ -83,7 +83,7 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
 
 def _caption(rows: list[Difference], a: Side, b: Side) -> str:
     """What the errors include, whose training differs, and which seeds, robots and metrics were not compared."""
-    from experiments.analysis.compare import other_sequences
+    from experiments.analysis.compare import of_other_tokens, other_sequences
 
     seeds = max(row.seeds for row in rows)
     over = f" and over {seeds} seeds" if seeds > 1 else ""
@@ -119,8 +119,8 @@ def _caption(rows: list[Difference], a: Side, b: Side) -> str:
             f"{escape(b.name)}, the longer list beginning with the shorter one."
         )
     explained = {row.metric for row in rows} | set(OF_WINDOWS)
-    if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:
-        caption += f" Nats are not compared: the tokenizers differ ({a.tokenizer}, {b.tokenizer})."
+    if why := of_other_tokens(a, b):
+        caption += f" {'Losses' if a.noising_steps and b.noising_steps else 'Nats'} are not compared: {why}."
         explained |= set(OF_TOKENS)
     elif not (a.tokenizer and b.tokenizer):
         caption += " Nats are comparable only if both saw the same tokens, which one of them does not say."

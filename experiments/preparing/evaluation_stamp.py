@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 STAMP = "evaluation.made_from.json"
 
+NOISING_STEPS = "noising_steps"
+"""What is recorded of a model on latents: the steps of its noising process, with which its loss is to be compared."""
+
 FORMERLY_NAMED = frozenset(
     "weight_cap time_shift recall chain_factors own_past_rounds displaced_past change_weight matrices".split()
 )
@@ -28,7 +31,8 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
     """The stamp of an evaluation on the windows of the datasets `names`.
 
     The step is only recorded, not compared: if a run trains on, later results replace earlier ones. For `hma compare`,
-    the planned number of training steps is recorded too, and the seed, which is also part of the model's hash.
+    the planned number of training steps is recorded too, and the seed and `NOISING_STEPS`, which are also part of the
+    model's hash.
     """
     chosen = {d.dataset: d.windows for d in prepared.manifest.datasets}
     data = {
@@ -52,6 +56,8 @@ def describe_evaluation(trained: Run, names: Sequence[str], prepared: PreparedDa
     recorded = {"step": trained.step}
     if "loader" in trained.provenance:  # a converted model does not record them
         recorded |= {"steps": trained.train.steps, "seed": trained.train.seed}
+    if trained.model.diffusion:
+        recorded[NOISING_STEPS] = trained.model.diffusion.steps
     return MadeFrom(inputs, recorded)
 
 

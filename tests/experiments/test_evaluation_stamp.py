@@ -16,7 +16,7 @@ from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, r
 from experiments.preparing.made_from import MadeFrom
 from experiments.running.result_file import SAMPLES
 from experiments.running.run_trial import write_evaluation
-from hma_jax.config import ConfigError, EvalConfig, ModelConfig, TrainConfig
+from hma_jax.config import ConfigError, DiffusionConfig, EvalConfig, ModelConfig, TrainConfig
 from hma_jax.config.base import later
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.evaluate import Evaluation
@@ -139,6 +139,9 @@ def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
 )
 def test_the_seed_and_the_steps_of_the_training_are_recorded_where_the_run_knows_them(provenance, recorded):
     of = vars(TRAINED) | {"train": TrainConfig(seed=7, steps=9), "provenance": provenance}
+    assert describe_evaluation(SimpleNamespace(**of), (), PREPARED, EvalConfig()).recorded == recorded
+    of["model"] = dataclasses.replace(TRAINED.model, diffusion=DiffusionConfig(steps=20))
+    recorded = recorded | {"noising_steps": 20}
     assert describe_evaluation(SimpleNamespace(**of), (), PREPARED, EvalConfig()).recorded == recorded
 
 

@@ -135,6 +135,16 @@ def test_nats_of_other_tokens_are_not_compared():
     assert {r.metric for r in compare(Side("a", psnr, "t"), other)} == {"psnr"}
 
 
+def test_losses_of_other_noising_processes_are_not_compared():
+    """The same network has a larger loss in fewer steps, since its bound is then a sum of fewer, larger terms."""
+    table = sides()[0].seeds[0]
+    metrics = dict.fromkeys(("diffusion_loss", "action_nats", "psnr"), table.metrics["cross_entropy"])
+    seeds = {0: replace(table, metrics=metrics)}
+    many, few, unknown = (Side(str(n), seeds, "t", noising_steps=n) for n in (1000, 20, 0))
+    assert {r.metric for r in compare(many, few)} == {"psnr"}
+    assert {r.metric for r in compare(many, many)} == {r.metric for r in compare(many, unknown)} == set(metrics)
+
+
 def test_other_windows_are_refused():
     a, b = sides()
     table = b.seeds[0]

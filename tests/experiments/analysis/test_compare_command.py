@@ -193,6 +193,17 @@ def test_nats_of_two_tokenizers_are_left_out_and_it_is_said(table, tmp_path, cap
     assert "Nats are not compared: the tokenizers differ (70c3, other)" in " ".join(capsys.readouterr().out.split())
 
 
+def test_losses_of_other_noising_processes_are_left_out_and_it_is_said(table, tmp_path, capsys):
+    of_latents = replace(table, metrics=dict.fromkeys(("diffusion_loss", "psnr"), table.metrics["cross_entropy"]))
+    for steps in (1000, 20):
+        write_evaluated(tmp_path / str(steps), of_latents, noising_steps=steps)
+    compared = (str(tmp_path / steps) for steps in ("1000", "20"))
+    assert main(["compare", *compared, "--to", str(tmp_path / "c.csv")]) == 0
+    assert {metric for _, metric in rows_of(tmp_path / "c.csv")} == {"psnr"}
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Losses are not compared: the noising processes have other numbers of steps (1000, 20)" in said
+
+
 def write_evaluated(directory, windows, seed=None, **recorded):
     directory.mkdir(parents=True)
     windows.save(directory / FILE, directory.name)
