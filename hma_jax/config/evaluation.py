@@ -144,12 +144,18 @@ def check_decoding(model: ModelConfig, decode: DecodeConfig) -> None:
             decode.top_k <= model.factor_vocab,
             f"decode.top_k {decode.top_k} exceeds the {model.factor_vocab} entries of a factor",
         )
+        require(not decode.resample, "decode.resample works only for models on latents; set it to false")
         return
     require(
         decode.order == "random",
         "decode.order 'confidence' needs probabilities, which models on latents do not predict; use 'random'",
     )
     require(decode.top_k == 0, "decode.top_k works only for models on ids: latents have no vocabulary; set it to 0")
+    require(
+        decode.temperature == 0 or decode.sampler.temperature > 0,
+        f"decode.temperature {decode.temperature} is that of ids, and latents are drawn at decode.sampler.temperature, "
+        "which is 0; set that one",
+    )
     steps, most = decode.sampler.steps, model.diffusion.steps
     require(
         steps <= most,

@@ -129,6 +129,8 @@ def test_the_confidence_in_a_token_is_the_product_of_its_factors_probabilities()
     [
         (None, DecodeConfig(top_k=9), "decode.top_k 9 exceeds the 8 entries"),
         (DIFFUSION, DecodeConfig(order="confidence"), "'confidence' needs probabilities"),
+        (None, DecodeConfig(resample=True), "resample works only for models on latents"),
+        (DIFFUSION, replace(DecodeConfig(), temperature=0.7), "latents are drawn at decode.sampler.temperature, which"),
         (DIFFUSION, DecodeConfig(top_k=3), "top_k works only for models on ids"),
         (
             DIFFUSION,
