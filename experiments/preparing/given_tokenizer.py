@@ -31,7 +31,7 @@ from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.terminal.progress import say, step
 from experiments.terminal.words import few
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, DiffusionConfig
 from hma_jax.config.json import diff, to_dict
 
 if TYPE_CHECKING:
@@ -49,6 +49,9 @@ JUDGED = "judged_on.json"
 
 USUAL_STD = (0.5, 2.0)
 """Standard deviations of latents that count as about 1; others are reported."""
+
+USUAL_MEAN = 1.0
+"""The largest absolute mean of latents that counts as about 0."""
 
 
 def require_same_tokenizer(source: Path | None, study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
@@ -99,7 +102,7 @@ def judge_tokenizer(
 ) -> None:
     """Measures how well the workspace's tokenizer, which was given, reconstructs frames that the study holds out;
     prints the result and writes it beside the tokenizer. Nothing is done if it was judged by the same frames before. A
-    note reports latents with an unusual scale. `threads` as in `make_frame_loader`."""
+    note reports latents with an unusual mean or scale. `threads` as in `make_frame_loader`."""
     from hma_jax.tokenizers.io import load_tokenizer
 
     place, sources = workspace.tokenizer, seen(study, sources)
@@ -112,15 +115,23 @@ def judge_tokenizer(
     held_out = make_frames(study, sources, tokenizer.image_size, split="val", threads=threads)
     with step("judge the tokenizer") as update:
         quality = reconstruction_psnr(tokenizer, held_out, lambda done, total: update(done, total, "frames"))
-        std = float(np.std(tokenizer.encode(next(held_out)), dtype=np.float64)) if tokenizer.channels else 1.0
+        latents = tokenizer.encode(next(held_out)) if tokenizer.channels else None
     save_quality(quality, place)
-    if not USUAL_STD[0] <= std <= USUAL_STD[1]:
-        say(
-            f"note: the tokenizer's latents have a standard deviation of {std:.3g} in held-out frames, but a model expects "
-            "about 1: it learns others badly, and generates none beyond model.diffusion.clip. Let the tokenizer divide its "
-            'latents by it (docs/own_data.md, "Your own tokenizer")'
-        )
+    if latents is not None:
+        say_unusual(np.asarray(latents, np.float64), (study.model.diffusion or DiffusionConfig()).clip)
     MadeFrom(frames).save(place, JUDGED)
+
+
+def say_unusual(latents: np.ndarray, clip: float) -> None:
+    """Prints a note on latents that a model would learn badly, or could not generate."""
+    mean, std, most = np.mean(latents), np.std(latents), np.abs(latents).max()
+    if not USUAL_STD[0] <= std <= USUAL_STD[1] or abs(mean) > USUAL_MEAN or most > clip:
+        say(
+            f"note: in held-out frames the tokenizer's latents have a mean of {mean:.3g} and a standard deviation of "
+            f"{std:.3g}, and reach {most:.3g}. A model expects about 0 and 1: it learns others badly, and generates none "
+            f"beyond model.diffusion.clip, {clip:g}. Let the tokenizer subtract the mean from its latents and divide them "
+            'by the deviation (docs/own_data.md, "Your own tokenizer")'
+        )
 
 
 def _training(stamp: MadeFrom | None) -> MadeFrom:

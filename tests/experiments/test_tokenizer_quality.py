@@ -115,17 +115,19 @@ def test_a_tokenizer_is_trained_on_what_the_store_does_not_hold_out_and_judged_o
 
 
 @pytest.mark.parametrize(
-    ("channels", "scale", "said"),
+    ("channels", "encode", "said"),
     [
-        (3, 1.0, ""),
-        (3, 5.5, "note: the tokenizer's latents have a standard deviation of 5.5"),
-        (3, 0.01, "standard deviation of 0.01 in"),
-        (0, 5.5, ""),  # ids
+        (3, lambda signs: signs, ""),
+        (3, lambda signs: 5.5 * signs, "mean of 0 and a standard deviation of 5.5, and reach 5.5."),
+        (3, lambda signs: 0.01 * signs, "standard deviation of 0.01,"),
+        (3, lambda signs: signs + 20, "mean of 20 and a standard deviation of 1, and reach 21."),
+        (3, lambda signs: np.append(np.tile(signs, 2000), 40), "none beyond model.diffusion.clip, 10."),
+        (0, lambda signs: 5.5 * signs, ""),  # ids
     ],
 )
-def test_latents_of_an_unusual_scale_are_told(channels, scale, said, tmp_path, monkeypatch, capsys):
+def test_unusual_latents_are_told(channels, encode, said, tmp_path, monkeypatch, capsys):
     """Models of them were trained in vain, without a word."""
-    tokenizer = SimpleNamespace(channels=channels, image_size=8, encode=lambda signs: scale * signs)
+    tokenizer = SimpleNamespace(channels=channels, image_size=8, encode=encode)
     monkeypatch.setattr("hma_jax.tokenizers.io.load_tokenizer", lambda _: tokenizer)
     monkeypatch.setattr(given_tokenizer, "make_frames", lambda *_, **__: iter([np.float32([-1, 1])]))
     monkeypatch.setattr(given_tokenizer, "reconstruction_psnr", lambda *_: Stat(20.0, 0.1, 8, 2))
