@@ -17,8 +17,9 @@ from experiments.running.closure import Closure
 from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.running.ledger import DIVERGED, FINISHED, MISSING, PREEMPTED, REFUSED, Ledger
+from experiments.running.monitor import SweepMonitor
 from experiments.running.provenance import Provenance, trial_closure
-from experiments.running.runner import Job, TrialsFailed, run_missing
+from experiments.running.runner import Job, run_missing
 from experiments.running.shared_runs import latest_common, share_runs
 from experiments.running.slots import find_accelerators
 from experiments.running.subprocess_call import call_in_subprocess
@@ -29,8 +30,9 @@ from experiments.study import Study
 from experiments.study_setup import StudySetup, count_again
 from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_asked, plan_sweeps
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
+from experiments.terminal.exit_code import TrialsFailed
 from experiments.terminal.program import PROGRAM
-from experiments.terminal.progress import SweepMonitor, console, say, short
+from experiments.terminal.progress import console, say, short
 from experiments.terminal.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict

@@ -16,9 +16,9 @@ from scipy.special import stdtr
 
 from data_pipelines.registry import FRAME_RATE
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.analysis.explained_share import read_shares
 from experiments.analysis.intervals import standard_errors
 from experiments.analysis.paired import require_same_windows
-from experiments.suite.explained import read_table
 from experiments.sweeps.sweep import POINT
 from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
@@ -64,7 +64,7 @@ def controllability(seeds: dict[int, WindowTable], role: str = POINT, *, rate: f
     """
     require(len(seeds) > 0, "there is no trial to compute controllability from")
     first, rows = next(iter(seeds.values())), []
-    truth = read_table() if rate == FRAME_RATE else {}  # over a step of another length it is another share
+    truth = read_shares() if rate == FRAME_RATE else {}  # over a step of another length it is another share
     matched = {}
     for seed, table in seeds.items():
         require_same_windows(first, table)

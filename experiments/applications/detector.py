@@ -33,8 +33,8 @@ from data_pipelines.suite.spec import IMAGE_SIZE
 from experiments.applications.detector_network import Detections, DetectorParams, detect, init_detector, points_loss
 from experiments.applications.scenes import Points, Scenes, draw_scenes, point_names
 from experiments.applications.settings_file import FILE, pin_settings
-from experiments.applications.simulators import load_simulator
-from experiments.applications.tables import write_rows
+from experiments.simulators import load_simulator
+from experiments.tables import write_rows
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import say, short, step, wrote

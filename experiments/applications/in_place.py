@@ -37,9 +37,9 @@ from experiments.applications.endurance.tables import Row, over_robots
 from experiments.applications.policies.tasks import join
 from experiments.applications.scenes import Points, point_names, points_of
 from experiments.applications.settings_file import pin_settings
-from experiments.applications.simulators import START_FRAMES, held_out, load_simulator, true_simulator
-from experiments.applications.tables import write_rows
 from experiments.running.run_options import UNSET
+from experiments.simulators import START_FRAMES, held_out, load_simulator, true_simulator
+from experiments.tables import write_rows
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import console, step, wrote

@@ -45,9 +45,9 @@ from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.tasks import Task, find_task
 from experiments.applications.settings_file import pin_settings
-from experiments.applications.simulators import load_simulator
-from experiments.applications.tables import make_once, write_table
 from experiments.running.workspace import Workspace
+from experiments.simulators import load_simulator
+from experiments.tables import make_once, write_table
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import step, wrote

@@ -30,10 +30,10 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from data_pipelines.publishing.files import publish
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
-from experiments.applications.simulators import held_out, in_suite, load_simulator, save_beside, true_simulator
 from experiments.bench.simulate import time_simulator
 from experiments.running.machine import describe_machine
 from experiments.running.run_options import UNSET
+from experiments.simulators import held_out, in_suite, load_simulator, save_beside, true_simulator
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from hma_jax.config import DecodeConfig, require

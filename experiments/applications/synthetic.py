@@ -76,10 +76,10 @@ from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import join
 from experiments.applications.settings_file import pin_settings, write_settings
-from experiments.applications.simulators import load_simulator
-from experiments.applications.tables import make_once, write_table
 from experiments.running.workspace import Workspace
+from experiments.simulators import load_simulator
 from experiments.study_setup import UNSET, use_entries
+from experiments.tables import make_once, write_table
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import Eta, say, step, wrote

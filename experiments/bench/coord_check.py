@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from experiments.applications.tables import write_table
 from experiments.bench.models import make_table, random_batch
 from experiments.study import Study
+from experiments.tables import write_table
 from experiments.terminal.progress import Update
 from hma_jax.config import MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig, require
 from hma_jax.diagnostics.coordinate_check import Size, measure

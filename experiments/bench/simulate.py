@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.applications.simulators import load_simulator
 from experiments.bench.record import Stage
 from experiments.bench.timing import time_by_turns, time_once
+from experiments.simulators import load_simulator
 from hma_jax.config import ExecutionConfig
 from hma_jax.config.execution import Dtype
 

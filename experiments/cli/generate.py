@@ -79,7 +79,7 @@ def generate(
         describe_training,
         open_trajectories,
     )
-    from experiments.applications.simulators import DEAF, load_simulator
+    from experiments.simulators import DEAF, load_simulator
     from hma_jax.runtime.outputs import make_directory
     from hma_jax.simulator.folder import change_decode, find_decode
 

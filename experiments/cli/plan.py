@@ -140,7 +140,7 @@ def _choose_model(
         config, table = make_shape(chosen["model"], chosen["robots"])
         execution = ExecutionConfig(chosen["dtype"], chosen["remat"], mesh=MeshConfig(*arguments.mesh or (1, -1, 1)))
         return chosen["model"], config, table, replace(TrainConfig(), batch=chosen["batch"]), execution
-    from experiments.dry_run.cost import declared_table
+    from experiments.declared_table import declared_table
     from experiments.sweeps.sweep import reference_trial
 
     require(

@@ -64,7 +64,7 @@ def play(
         if error.name != "aiohttp":
             raise
         raise ConfigError("the page needs aiohttp: pip install 'hma-jax[play]'") from error
-    from experiments.applications.simulators import (
+    from experiments.simulators import (
         DEAF,
         in_suite,
         load_simulator,

@@ -12,7 +12,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from data_pipelines.registry import DatasetSpec, get_spec
+from experiments.declared_table import declared_table
 from experiments.dry_run.done import NOTHING, Done
 from experiments.running.run_options import UNWATCHED
 from experiments.running.shared_runs import share_runs
@@ -70,20 +70,6 @@ def _count_parameters(model: ModelConfig, table: EmbodimentTable) -> int:
     from hma_jax.model.hma import declare_model
 
     return declare_model(model, table).count()
-
-
-@functools.cache
-def declared_table(names: tuple[str, ...], rate: float | None) -> EmbodimentTable:
-    """Embodiments with the right action sizes and no statistics.
-
-    Raises ConfigError for a name that the registry does not know.
-    """
-
-    def entry(spec: DatasetSpec) -> Embodiment:
-        dim = spec.action_dim
-        return Embodiment(spec.name, dim, spec.stride_at(rate), mean=(0.0,) * dim, std=(1.0,) * dim)
-
-    return EmbodimentTable(tuple(entry(get_spec(name)) for name in names))
 
 
 def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:

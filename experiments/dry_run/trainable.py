@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from experiments.dry_run.cost import declared_table
+from experiments.declared_table import declared_table
 from experiments.dry_run.done import UNKNOWN
 from experiments.running.launchers.registry import LauncherOptions
 from experiments.study import Study

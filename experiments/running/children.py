@@ -7,14 +7,9 @@ pools take their size from the cores that a process may use.
 from __future__ import annotations
 
 import faulthandler
-import logging
 import os
 import signal
 import socket
-import sys
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from experiments.running.slots import Slot
@@ -29,9 +24,6 @@ _PARENT, _CORES, _ACCELERATOR = "HMA_PARENT_PID", "HMA_CORES", "HMA_ACCELERATOR"
 CHOSEN = {"XLA_PYTHON_CLIENT_MEM_FRACTION"}
 """Variables of a slot that the user's environment overrides. The accelerators of a slot are not among them: they are
 chosen from those that the user allows."""
-
-LOGGERS = ("hma_jax", "data_pipelines", "experiments")
-"""Parents of all loggers of this project."""
 
 
 class NoAccelerator(ConfigError):
@@ -95,37 +87,3 @@ def require_accelerator(kind: str | None = None) -> None:
             f"{socket.gethostname()}: a {kind.upper()} is expected, but JAX computes on {found}{why}; check its driver, and "
             f"that JAX is installed for it (pip install {extra}), or set JAX_PLATFORMS=cpu to do without"
         )
-
-
-def silence_background() -> None:
-    """Silences background reports for the rest of this process: if a checkpoint turns out damaged, its reader tasks
-    report it at length, from threads and destructors where nothing can catch it, until the very end. The error message
-    says it once.
-    """
-    sys.unraisablehook = _say_nothing
-    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
-    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
-
-
-@contextmanager
-def plain_messages() -> Iterator[None]:
-    """While the block runs, each log message of this project is a plain line on standard error, even after a library
-    has called `logging.basicConfig`, which would prefix it with a level and a module. The stream is looked up at each
-    message: a progress bar replaces standard error to show lines above itself."""
-    handler, loggers = logging.lastResort, [logging.getLogger(name) for name in LOGGERS]
-    for logger in loggers:
-        logger.addHandler(handler)
-        logger.propagate = False
-    try:
-        yield
-    finally:
-        for logger in loggers:
-            logger.removeHandler(handler)
-            logger.propagate = True
-
-
-def background_is_silent() -> bool:
-    return sys.unraisablehook is _say_nothing
-
-
-def _say_nothing(_: object) -> None: ...

@@ -37,7 +37,6 @@ from experiments.running.launchers.base import Launcher
 from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
 from experiments.running.shared_disk import retry_io
 from hma_jax.config import ConfigError
-from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import IO_ERRNOS, write_file
 from hma_jax.runtime.locks import EXPIRES, RENEWED_EVERY
 
@@ -58,14 +57,6 @@ RELAUNCH_SECONDS = 60.0
 """Seconds until trials that the launcher did not take, though it took others before, are launched again."""
 
 log = logging.getLogger(__name__)
-
-
-class TrialsFailed(Exception):
-    """The sweep ran to its end, but some trials have no result. `exit`: the command's exit code."""
-
-    def __init__(self, message: str, exit: Exit = Exit.FAILED):
-        super().__init__(message)
-        self.exit = exit
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar
 
-from experiments.running.children import background_is_silent, enter_child, plain_messages, silence_background
+from experiments.running.children import enter_child
 from experiments.running.launchers.base import GRACE_SECONDS
+from experiments.terminal.messages import background_is_silent, plain_messages, silence_background
 from hma_jax.runtime.exits import Terminated, sigterm_as_interrupt
 
 T = TypeVar("T")

@@ -23,7 +23,7 @@ from data_pipelines.suite.embodiments import EMBODIMENTS, UNSEEN
 from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
-from experiments.suite.explained import read_table
+from experiments.analysis.explained_share import read_shares
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 
@@ -76,7 +76,7 @@ def draw(out: Annotated[Path, arg(metavar="DIR")]) -> None:
         out: Directory for both.
     """
     out.mkdir(parents=True, exist_ok=True)
-    shares, page = read_table(), [HEAD]
+    shares, page = read_shares(), [HEAD]
     families = {
         s.family: [t for t in EMBODIMENTS if t.family == s.family]
         for s in sorted(EMBODIMENTS, key=lambda s: s in UNSEEN)

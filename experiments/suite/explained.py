@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import csv
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -31,28 +30,15 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
+from experiments.analysis.explained_share import EXPLAINED, ExplainedShare
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 
-OUT = Path(__file__).parents[1] / "results" / "suite" / "explained.csv"
 STATES = 96
 ACTIONS = 8
 """Drawn for each state."""
 
 PIXELS = 32
-
-
-@dataclass(frozen=True)
-class ExplainedShare:
-    """A row of the table. `sem` is the standard error over states, `moved` the root mean square of
-    x' - x in grey levels."""
-
-    robot: str
-    family: str
-    action_values: int
-    share: float
-    sem: float
-    moved: float
 
 
 def explained(spec: EmbodimentSpec, states: int = STATES) -> ExplainedShare:
@@ -99,20 +85,8 @@ def frames_of(spec: EmbodimentSpec, state: State) -> np.ndarray:
     return pooled.astype(np.float64).mean((2, 4))
 
 
-def read_table(path: Path = OUT) -> dict[str, ExplainedShare]:
-    """The committed table, by robot."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {
-        r["robot"]: ExplainedShare(
-            r["robot"], r["family"], int(r["action_values"]), float(r["share"]), float(r["sem"]), float(r["moved"])
-        )
-        for r in rows
-    }
-
-
 def measure_robots(
-    out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(default: the committed one)")] = OUT,
+    out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(default: the committed one)")] = EXPLAINED,
 ) -> None:
     """Measures all robots and writes a table.
 

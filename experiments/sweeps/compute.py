@@ -78,7 +78,7 @@ def of_width(trial: Trial, width: int) -> Trial:
 
 def flops_per_step(trial: Trial) -> float:
     """Training FLOPs of one step, by formula, with action sizes from the registry."""
-    from experiments.dry_run.cost import declared_table
+    from experiments.declared_table import declared_table
     from hma_jax.model.flops import train_flops_per_step
 
     return train_flops_per_step(trial.model, declared_table(trial.datasets, trial.rate), trial.train)

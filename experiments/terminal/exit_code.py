@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 
 from data_pipelines.errors import DataError, EpisodeError
-from experiments.running.children import plain_messages, silence_background
-from experiments.running.runner import TrialsFailed
+from experiments.terminal.messages import plain_messages, silence_background
 from experiments.terminal.program import prepare_output
 from experiments.terminal.progress import OUTPUT, errors
 from hma_jax.config import ConfigError
@@ -25,6 +24,14 @@ OUT_OF_MEMORY = (
     "program on the device may hold the rest.)"
 )
 """Added to what the compiler or a device says."""
+
+
+class TrialsFailed(Exception):
+    """The sweep ran to its end, but some trials have no result. `exit`: the command's exit code."""
+
+    def __init__(self, message: str, exit: Exit = Exit.FAILED):
+        super().__init__(message)
+        self.exit = exit
 
 
 def exit_code_of(

@@ -13,13 +13,10 @@ from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
 from rich.measure import Measurement
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 from rich.text import Text
 
-from experiments.running.attempts import State
-from experiments.running.ledger import FINISHED
-from experiments.running.runner import Job, Monitor
 from hma_jax.runtime.exits import raise_pending_stop
 from hma_jax.runtime.files import naming
 
@@ -73,7 +70,8 @@ def wrote(*paths: Path, then: str = "", about: str = "") -> None:
         say(f"note: {about}")
 
 
-def _bars() -> Progress:
+def make_bars() -> Progress:
+    """Bars of several tasks, each with a `note`; nothing without a terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=28),
@@ -92,7 +90,7 @@ def step(title: str) -> Iterator[Update]:
     began = time.monotonic()
     if not console.is_terminal:
         console.print(f"{title} ...")
-    with _bars() as bars:
+    with make_bars() as bars:
         task = bars.add_task(title, total=None, note="")
         last_line = began
 
@@ -105,7 +103,7 @@ def step(title: str) -> Iterator[Update]:
                 console.print(f"{title}: {done}/{total} {escape(note)}", soft_wrap=True)
 
         yield update
-    console.print(f"[green]done[/] {title} [dim]({_clock(time.monotonic() - began)})")
+    console.print(f"[green]done[/] {title} [dim]({duration(time.monotonic() - began)})")
 
 
 class Eta:
@@ -126,7 +124,7 @@ class Eta:
         began, before = self._first
         if done <= before or done >= total:
             return ""
-        return f", {_clock((now - began) / (done - before) * (total - done))} left"
+        return f", {duration((now - began) / (done - before) * (total - done))} left"
 
 
 class TidyTable(Table):
@@ -198,45 +196,8 @@ def tidy_table(title: str, *columns: str) -> TidyTable:
     return table
 
 
-class SweepMonitor(Monitor):
-    """A bar for each running trial below one for all trials; a line for each trial that ends."""
-
-    def __init__(self, total: int, done: int = 0):
-        self.total, self.ended_count = total, done
-        self.bars = _bars()
-        self.tasks: dict[str, TaskID] = {}
-        self.all = self.bars.add_task("trials", total=total, completed=done, note="")
-
-    def __enter__(self) -> SweepMonitor:
-        self.bars.start()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.bars.stop()
-
-    def launched(self, job: Job, resumed: bool) -> None:
-        note = "resuming" if resumed else "starting"
-        self.tasks[job.id] = self.bars.add_task(f"  {escape(job.title)}", total=None, note=note)
-
-    def progressed(self, job: Job, phase: str, done: int, total: int) -> None:
-        self.bars.update(self.tasks[job.id], completed=done, total=total, note=phase)
-
-    def ended(self, job: Job, state: State, seconds: float, again: bool) -> None:
-        if job.id in self.tasks:  # otherwise an earlier command started it
-            self.bars.remove_task(self.tasks.pop(job.id))
-        if not again:
-            self.ended_count += 1
-            self.bars.update(self.all, completed=self.ended_count)
-        colour = "green" if state.event == FINISHED else "yellow" if again else "red"
-        message = f": {escape(state.message)}" if state.message else ""
-        more = "; it continues from its last checkpoint" if again else ""
-        self.bars.console.print(
-            f"[{colour}]{state.event}[/] {self.ended_count}/{self.total} {escape(job.title)} "
-            f"[dim]({_clock(seconds)})[/]{message}{more}"
-        )
-
-
-def _clock(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """2 h 5 min, 3 min 20 s or 4.2 s."""
     minutes, rest = divmod(round(seconds), 60)
     if minutes >= 60:
         return f"{minutes // 60} h {minutes % 60} min"

@@ -88,7 +88,7 @@ class _Task:
         require(
             bool(names),
             "there are no starts, so no episode can begin: give `starts`, a run with starts beside it, or a "
-            "`simulator` that has starts. For a run of `hma train`, experiments.applications.simulators."
+            "`simulator` that has starts. For a run of `hma train`, experiments.simulators."
             f"make_simulator({'RUN' if run is None else str(run)!r}, episodes={episodes}) makes one that starts at held-out "
             "recordings",
         )

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from experiments.cli.main import main
+from experiments.declared_table import declared_table
 from experiments.dry_run.cost import (
     checkpoint_bytes,
-    declared_table,
     estimate,
     evaluation_flops_per_window,
     plan_trials,

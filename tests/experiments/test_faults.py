@@ -24,9 +24,10 @@ from experiments.running import run_trial as trials
 from experiments.running import trial_main
 from experiments.running.attempts import AttemptEnd, State, outcome
 from experiments.running.provenance import InputsChanged
-from experiments.running.runner import Job, TrialsFailed
+from experiments.running.runner import Job
 from experiments.running.shared_runs import SharedTraining
 from experiments.running.workspace import Workspace
+from experiments.terminal.exit_code import TrialsFailed
 from hma_jax.runtime.exits import Exit
 from hma_jax.training import train as model_training
 from hma_jax.training.log import RunLog

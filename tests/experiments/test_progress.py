@@ -8,9 +8,10 @@ import pytest
 from rich.console import Console
 
 from experiments.running.attempts import State
+from experiments.running.monitor import SweepMonitor
 from experiments.running.runner import Job
 from experiments.terminal import progress
-from experiments.terminal.progress import SweepMonitor, say, short, tidy_table
+from experiments.terminal.progress import say, short, tidy_table
 
 METRICS = ("perplexity", "accuracy", "psnr", "ssim", "delta_psnr", "action_nats", "retrieval")
 

@@ -23,7 +23,7 @@ from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.machine import commit_of
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
 from experiments.running.result_file import read_result, write_result
-from experiments.running.runner import Job, TrialsFailed, run_missing
+from experiments.running.runner import Job, run_missing
 from experiments.running.trial import trial_id
 from experiments.running.trial_checks import check_finished, group_by_sources, require_one_closure
 from experiments.running.workspace import Workspace, find_record, save_record
@@ -31,6 +31,7 @@ from experiments.study import SCALING
 from experiments.study_setup import StudyArguments, make_setup
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import unique_trials
+from experiments.terminal.exit_code import TrialsFailed
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit
 from tests.experiments import fake_trial

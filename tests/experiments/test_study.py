@@ -8,7 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.dry_run.cost import ONE_ROBOT, declared_table, estimate
+from experiments.declared_table import declared_table
+from experiments.dry_run.cost import ONE_ROBOT, estimate
 from experiments.presets import ACCELERATOR, CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id

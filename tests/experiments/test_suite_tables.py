@@ -11,9 +11,10 @@ import pytest
 from data_pipelines.suite.embodiments import EMBODIMENTS, siblings
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.world import World
+from experiments.analysis.explained_share import read_shares
 from experiments.suite import explained as explained_module
 from experiments.suite.clips import animation, clip
-from experiments.suite.explained import explained, read_table
+from experiments.suite.explained import explained
 from experiments.suite.siblings import OUT, Samples, gain, judge, predictor, sample
 from experiments.suite.tokenizer import quality
 
@@ -26,7 +27,7 @@ def sibling_rows() -> dict[str, dict[str, str]]:
 
 
 def test_actions_explain_enough_of_what_changes():
-    table = read_table()
+    table = read_shares()
     assert list(table) == list(BY_NAME)
     assert sum(row.share >= 0.3 for row in table.values()) >= 40
     assert all(row.sem < 0.05 and row.moved > 3 for row in table.values())
@@ -34,7 +35,7 @@ def test_actions_explain_enough_of_what_changes():
 
 @pytest.mark.parametrize("name", ["pusher_sand", "picker_slate"])
 def test_the_simulator_still_gives_the_committed_shares(name):
-    now, then = explained(BY_NAME[name]), read_table()[name]
+    now, then = explained(BY_NAME[name]), read_shares()[name]
     assert now.share == pytest.approx(then.share, abs=2e-3)
     assert now.moved == pytest.approx(then.moved, abs=0.05)
 
@@ -98,7 +99,7 @@ def test_siblings_share_dynamics_in_every_family():
     said = f"{min(errors['strangers'])} % or more if fitted on four robots of another family with equally many action values"
     assert said in page
     assert f"{min(errors['shuffled'])} % or more if fitted on the siblings with shuffled actions" in page
-    shares = [round(100 * row.share) for row in read_table().values()]
+    shares = [round(100 * row.share) for row in read_shares().values()]
     assert f"actions explain {min(shares)} to {max(shares)} % of the change of its pixels" in page
 
 

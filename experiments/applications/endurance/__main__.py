@@ -24,10 +24,10 @@ from experiments.applications.endurance.figures import draw_curves, draw_sheet, 
 from experiments.applications.endurance.films import load_films, make_films, save_films
 from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row, over_robots, rows_of
-from experiments.applications.simulators import load_simulator
-from experiments.applications.tables import write_rows
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace
+from experiments.simulators import load_simulator
+from experiments.tables import write_rows
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import console, step, wrote

@@ -33,8 +33,8 @@ from experiments.applications.endurance.drives import native_robots
 from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row
 from experiments.applications.scenes import VISIBLE_SHARE, points_of
-from experiments.applications.simulators import START_FRAMES, load_simulator
-from experiments.applications.tables import write_rows
+from experiments.simulators import START_FRAMES, load_simulator
+from experiments.tables import write_rows
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from experiments.terminal.progress import console, step, wrote

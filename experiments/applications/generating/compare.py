@@ -14,7 +14,7 @@ from experiments.analysis.intervals import Interval, interval_of
 from experiments.applications.generating.source import ACTION, IMAGE
 from experiments.applications.generating.trajectories import Trajectories
 from experiments.applications.play.recording import encode_video
-from experiments.applications.tables import write_table
+from experiments.tables import write_table
 from experiments.terminal.progress import Update
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.evaluation.statistics import mean_and_sem

@@ -15,7 +15,7 @@ import numpy as np
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.intervals import Interval
 from experiments.applications.judging.agreement import rate_interval
-from experiments.applications.tables import write_table
+from experiments.tables import write_table
 
 Trials = dict[tuple[int, int], dict[str, list[float]]]
 """{(place of the condition, seed): {success and distance by start, where a simulator judged; error by held-out

@@ -16,7 +16,7 @@ from experiments.applications.judging.outcomes import WORLDS
 from experiments.applications.judging.rollouts import make_starts
 from experiments.applications.policies.demonstrations import Demonstrations, record
 from experiments.applications.policies.tasks import OWN, Task, join
-from experiments.applications.simulators import has_truth, true_simulator
+from experiments.simulators import has_truth, true_simulator
 from experiments.terminal.progress import say, step
 from hma_jax.config import require
 from hma_jax.simulator.interface import AnySimulator

@@ -32,8 +32,8 @@ from experiments.applications.judging.user_success import PAGE, UserSuccess
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
 from experiments.applications.settings_file import pin_settings, short_hash
-from experiments.applications.simulators import load_simulator
 from experiments.running.workspace import Workspace
+from experiments.simulators import load_simulator
 from experiments.terminal.progress import step
 from experiments.terminal.words import few
 from experiments.user_input.user_file import naming_line

@@ -14,7 +14,7 @@ import numpy as np
 from experiments.applications.judging.head import Head
 from experiments.applications.judging.rollouts import Rollout
 from experiments.applications.policies.tasks import AnyTask, held
-from experiments.applications.tables import write_table
+from experiments.tables import write_table
 from hma_jax.config import ConfigError
 
 TRUE, LEARNED, SHUFFLED = "true", "learned", "shuffled"

@@ -26,7 +26,7 @@ from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.learning import Report, log_spaced_steps
 from experiments.applications.policies.network import downsample_uint8
 from experiments.applications.policies.tasks import RecordedTask, held
-from experiments.applications.simulators import START_FRAMES
+from experiments.simulators import START_FRAMES
 from experiments.terminal.progress import step
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot

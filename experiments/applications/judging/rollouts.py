@@ -15,7 +15,7 @@ from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.policies.learning import Report
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import AnyTask, Task, join, world_of
-from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
+from experiments.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.simulator.interface import AnySimulator, require_frame_steps

@@ -13,7 +13,7 @@ from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
-from experiments.applications.simulators import START_FRAMES
+from experiments.simulators import START_FRAMES
 from hma_jax.config import require
 from hma_jax.simulator.interface import require_frame_steps
 from hma_jax.simulator.robots import Robot

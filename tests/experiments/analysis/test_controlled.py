@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.controllability import controllability, count_following, expected_by_chance
-from experiments.suite.explained import read_table
+from experiments.analysis.explained_share import read_shares
 from tests.experiments.analysis.worlds import judged
 
 
@@ -15,7 +15,7 @@ def model(follows: float, seed: int = 0, shift: float = 0.0):
     rng = np.random.default_rng(seed)
     table = judged(rng, robots=3, episodes=8)
     n = len(table)
-    names = {"r0": "two_link_arm", "r1": sorted(read_table())[0], "r2": "mine"}
+    names = {"r0": "two_link_arm", "r1": sorted(read_shares())[0], "r2": "mine"}
     scatter = np.repeat(np.random.default_rng(1).normal(size=n // 4), 4)
     metrics = {
         "psnr_copy": table.metrics["psnr_copy"],
@@ -91,7 +91,7 @@ def test_rounding_is_no_control():
 
 
 def test_a_row_says_what_there_is_to_follow():
-    rows, truth = controllability({0: model(1.0)}, rate=2.0), read_table()
+    rows, truth = controllability({0: model(1.0)}, rate=2.0), read_shares()
     for row in rows:
         assert row.explained == truth[row.robot].share if row.robot in truth else np.isnan(row.explained)
     assert {row.robot for row in rows} >= {"mine", sorted(truth)[0]}

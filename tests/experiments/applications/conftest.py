@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from data_pipelines.suite.simulator import suite_starts
-from experiments.applications import simulators
+from experiments import simulators
 from hma_jax.simulator.starts import Start
 from tests.experiments.applications.browser import browsing, chromium  # noqa: F401  fixtures
 from tests.hma_jax.simulator.compiled import shared_programs  # noqa: F401  a fixture

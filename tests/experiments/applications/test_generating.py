@@ -23,8 +23,8 @@ from experiments.applications.generating import source as source_module
 from experiments.applications.generating import trajectories as trajectories_module
 from experiments.applications.generating.survey import survey
 from experiments.applications.generating.trajectories import describe, describe_training, open_trajectories
-from experiments.applications.simulators import load_simulator
 from experiments.cli.main import main
+from experiments.simulators import load_simulator
 from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from hma_jax.evaluation.metrics import MAX_PSNR
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable

@@ -11,9 +11,9 @@ import pytest
 
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
+from experiments import simulators
 from experiments.applications import detector as detector_module
 from experiments.applications import in_place as in_place_module
-from experiments.applications import simulators
 from experiments.applications.detector import (
     Detector,
     detection_errors,
@@ -28,7 +28,7 @@ from experiments.applications.detector import (
 from experiments.applications.detector_network import Detections, init_detector
 from experiments.applications.in_place import CLOSE_PX, EPISODES, VIEWS, in_place, measure_ends
 from experiments.applications.scenes import Points, Scenes, draw_scenes, point_names
-from experiments.applications.simulators import load_simulator
+from experiments.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts

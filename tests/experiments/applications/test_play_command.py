@@ -41,7 +41,7 @@ def not_warmed_up(monkeypatch):
 
 
 def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(monkeypatch, tmp_path):
-    from experiments.applications import simulators
+    from experiments import simulators
 
     asked = []
 
@@ -57,7 +57,7 @@ def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(mo
 
 
 def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp_path):
-    from experiments.applications import simulators
+    from experiments import simulators
     from experiments.cli.play import play
 
     first, compiled = [], []
@@ -77,7 +77,7 @@ def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp
 
 @pytest.mark.usefixtures("not_warmed_up")
 def test_the_command_answers_at_its_host_and_at_the_public_names_that_it_is_given(monkeypatch, tmp_path, capsys):
-    from experiments.applications import simulators
+    from experiments import simulators
 
     answers = {}
 
@@ -98,7 +98,7 @@ def test_the_command_answers_at_its_host_and_at_the_public_names_that_it_is_give
 
 def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, capsys):
     """Those of a model that robots were added to: there are frames of these alone."""
-    from experiments.applications import simulators
+    from experiments import simulators
     from hma_jax.simulator import warm_up
 
     model = simulator(episodes=1)
@@ -113,7 +113,7 @@ def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, c
 
 
 def test_the_command_and_the_page_say_that_a_model_without_actions_follows_none(monkeypatch, tmp_path, capsys):
-    from experiments.applications import simulators
+    from experiments import simulators
     from hma_jax.simulator import warm_up
 
     monkeypatch.setattr(simulators, "load_simulator", lambda *_, **__: model)
@@ -140,7 +140,7 @@ def test_the_command_and_the_page_say_that_a_model_without_actions_follows_none(
     ],
 )
 def test_the_address_that_it_prints_can_be_opened(host, said, monkeypatch, tmp_path, capsys):
-    from experiments.applications import simulators
+    from experiments import simulators
 
     async def serve(app, host, port, ready):
         ready(port)
@@ -154,7 +154,7 @@ def test_the_address_that_it_prints_can_be_opened(host, said, monkeypatch, tmp_p
 @pytest.mark.usefixtures("not_warmed_up")
 def test_a_place_where_nobody_can_listen_may_be_the_fault_of_either_option(monkeypatch, tmp_path, capsys):
     """An unknown host was told to choose another port."""
-    from experiments.applications import simulators
+    from experiments import simulators
 
     async def serve(*_):
         raise OSError(-2, "Name or service not known")
@@ -169,7 +169,7 @@ def test_a_place_where_nobody_can_listen_may_be_the_fault_of_either_option(monke
 @pytest.mark.usefixtures("not_warmed_up")
 def test_an_output_that_is_closed_is_no_fault_of_host_or_port(monkeypatch, tmp_path):
     """The command ended with 2, as for wrong arguments, after which a scheduler does not start it again."""
-    from experiments.applications import simulators
+    from experiments import simulators
     from experiments.cli import play as command
 
     def closed(*_, **__):
@@ -193,7 +193,7 @@ def test_the_page_is_read_in_any_locale():
 
 def test_a_taken_port_is_said_before_anything_is_loaded(monkeypatch, tmp_path, capsys):
     """It was said after minutes of compiling."""
-    from experiments.applications import simulators
+    from experiments import simulators
 
     monkeypatch.undo()  # addresses are asked for
     monkeypatch.setattr(simulators, "load_simulator", lambda *_, **__: pytest.fail("it loads"))
@@ -207,7 +207,7 @@ def test_a_taken_port_is_said_before_anything_is_loaded(monkeypatch, tmp_path, c
 @pytest.mark.usefixtures("not_warmed_up")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
 def test_a_signal_ends_the_command_with_its_code_and_a_true_word(number, code, monkeypatch, tmp_path, capsys):
-    from experiments.applications import simulators
+    from experiments import simulators
 
     async def serve(app, host, port, ready):
         ready(port)
@@ -220,7 +220,7 @@ def test_a_signal_ends_the_command_with_its_code_and_a_true_word(number, code, m
 
 
 def test_a_request_to_stop_that_was_lost_while_it_compiled_is_obeyed_before_it_serves(monkeypatch, tmp_path):
-    from experiments.applications import simulators
+    from experiments import simulators
     from hma_jax.simulator import warm_up
 
     def lost(*_, **__):

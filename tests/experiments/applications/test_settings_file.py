@@ -14,8 +14,8 @@ import pytest
 
 from experiments.applications import own_policy
 from experiments.applications.settings_file import hash_of, pin_settings
-from experiments.applications.tables import make_once
 from experiments.running.machine import git_commit
+from experiments.tables import make_once
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.config.base import later
 from hma_jax.config.json import completed, to_dict

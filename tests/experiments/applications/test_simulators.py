@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from experiments import simulators as simulators_module
 from experiments.applications import DRIVEN
 from experiments.applications import ship as ship_module
-from experiments.applications import simulators as simulators_module
 from experiments.applications.ship import ship
-from experiments.applications.simulators import load_simulator, make_simulator
 from experiments.bench.record import read_record
 from experiments.cli.main import main
 from experiments.running.workspace import Workspace
+from experiments.simulators import load_simulator, make_simulator
 from hma_jax import Simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.config.base import later

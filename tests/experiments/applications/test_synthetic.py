@@ -39,8 +39,8 @@ from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig
 from experiments.applications.policies.demonstrations import Demonstrations, save_demonstrations
 from experiments.applications.policies.network import EncoderConfig
-from experiments.applications.simulators import load_simulator
 from experiments.applications.synthetic import choose, make_data, run_trial
+from experiments.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.simulator.folder import DECODE, change_decode, save_decode
 from hma_jax.simulator.robots import Robot

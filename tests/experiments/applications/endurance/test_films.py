@@ -15,7 +15,7 @@ from experiments.applications.endurance import films
 from experiments.applications.endurance.drives import make_drive
 from experiments.applications.endurance.films import Film, make_films
 from experiments.applications.endurance.hidden import Event, judge
-from experiments.applications.simulators import load_simulator
+from experiments.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from tests.experiments.applications.runs import make_run

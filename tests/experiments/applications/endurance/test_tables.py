@@ -11,7 +11,7 @@ from experiments.applications.endurance.__main__ import main, print_rows, true_s
 from experiments.applications.endurance.films import Film, colour_histogram, load_films, save_films
 from experiments.applications.endurance.hidden import MIN_HIDDEN, find_events
 from experiments.applications.endurance.tables import MEASURES, measure, motion, over_robots, read_rows, rows_of
-from experiments.applications.tables import write_rows
+from experiments.tables import write_rows
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start

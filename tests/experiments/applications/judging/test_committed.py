@@ -15,7 +15,7 @@ from experiments.applications.judging.summary import COLUMNS, COMPARED, CONTROL,
 from experiments.applications.judging.true_rates import draw_rates, noise_of_starts
 from experiments.applications.policies import find_task, record
 from experiments.applications.policies.tasks import held, world_of
-from experiments.applications.simulators import true_worlds
+from experiments.simulators import true_worlds
 from hma_jax.simulator.folder import DEFAULT_DECODE, find_decode
 from hma_jax.simulator.robots import Robot
 from tests.pages import rows_below, table

@@ -8,7 +8,7 @@ import numpy as np
 from experiments.applications.judging.ground_truth import describe_rare_success
 from experiments.applications.judging.rollouts import STARTS_SEED, make_starts
 from experiments.applications.policies.tasks import find_task
-from experiments.applications.simulators import true_starts, true_worlds
+from experiments.simulators import true_starts, true_worlds
 from hma_jax.simulator.robots import Robot
 
 

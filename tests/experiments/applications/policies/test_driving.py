@@ -6,7 +6,7 @@ import pytest
 from experiments.applications.judging.rollouts import make_starts, run
 from experiments.applications.policies import find_task, record
 from experiments.applications.policies.driving import new_episodes
-from experiments.applications.simulators import true_worlds
+from experiments.simulators import true_worlds
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
 from tests.data_pipelines.simulators.points import use_points

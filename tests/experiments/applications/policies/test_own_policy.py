@@ -29,7 +29,7 @@ from experiments.applications.policies.cloning import BcConfig
 from experiments.applications.policies.closed_loop import start_seeds
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.network import EncoderConfig
-from experiments.applications.simulators import load_simulator
+from experiments.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.convert.run_directory import write_run
 from hma_jax.model.hma import declare_model
