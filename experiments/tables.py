@@ -22,6 +22,7 @@ def make_once(path: Path, make: Callable[..., Any], *args: Any) -> Any:
 
 def write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Replaces the file, completely or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([names, *rows])
     write_file(path, text.getvalue())
@@ -31,5 +32,4 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     """Writes rows with the names of the first one; floats have four decimals."""
     names = list(rows[0])
     cells = [[f"{v:.4f}" if isinstance(v := row[name], float) else v for name in names] for row in rows]
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_table(path, names, cells)

@@ -1,5 +1,5 @@
 """Question: how much of the change in the images do a robot's actions explain?
-Command: python -m experiments.suite.explained [--out experiments/results/suite/explained.csv]
+Command: python -m experiments.suite.explained [--out FILE]
 Cost: about two minutes of one core.
 
 From equal states, actions drawn from the robot's own data are executed in the true simulator for
@@ -15,7 +15,6 @@ controllability is judged against this share.
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -31,6 +30,8 @@ from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
 from experiments.analysis.explained_share import EXPLAINED, ExplainedShare
+from experiments.suite import COMMITTED
+from experiments.tables import write_table
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 
@@ -86,7 +87,7 @@ def frames_of(spec: EmbodimentSpec, state: State) -> np.ndarray:
 
 
 def measure_robots(
-    out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(default: the committed one)")] = EXPLAINED,
+    out: Annotated[Path, arg(metavar="FILE", help_behavior_hint=COMMITTED)] = EXPLAINED,
 ) -> None:
     """Measures all robots and writes a table.
 
@@ -97,13 +98,8 @@ def measure_robots(
     for spec in EMBODIMENTS:
         rows.append(explained(spec))
         print(f"{rows[-1].robot:18s} {rows[-1].share:.2f} ± {rows[-1].sem:.2f}", flush=True)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["robot", "family", "action_values", "share", "sem", "moved"])
-        writer.writerows(
-            [r.robot, r.family, r.action_values, f"{r.share:.4f}", f"{r.sem:.4f}", f"{r.moved:.2f}"] for r in rows
-        )
+    cells = [[r.robot, r.family, r.action_values, f"{r.share:.4f}", f"{r.sem:.4f}", f"{r.moved:.2f}"] for r in rows]
+    write_table(out, ["robot", "family", "action_values", "share", "sem", "moved"], cells)
     enough = sum(r.share >= 0.3 for r in rows)
     print(f"{enough} of {len(rows)} robots: actions explain at least 30 % of the pixels' change")
 

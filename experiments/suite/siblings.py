@@ -1,5 +1,5 @@
 """Question: do the robots of a family share dynamics that can be learned from one another?
-Command: python -m experiments.suite.siblings [--out experiments/results/suite/siblings.csv]
+Command: python -m experiments.suite.siblings [--out FILE]
 Cost: about three minutes of one core.
 Expected: in every family, four siblings predict the fifth better than four strangers do, and better
 than the same siblings with their actions shuffled.
@@ -13,7 +13,6 @@ robots of the other family with the same number of action values; each of them i
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,12 +27,15 @@ from data_pipelines.suite.embodiments import EMBODIMENTS, siblings, strangers
 from data_pipelines.suite.render import positions_of
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
+from experiments.analysis.explained_share import EXPLAINED
 from experiments.analysis.intervals import interval_of
+from experiments.suite import COMMITTED
+from experiments.tables import write_table
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from hma_jax.evaluation.statistics import mean_and_sem
 
-OUT = Path("experiments/results/suite/siblings.csv")
+OUT = EXPLAINED.with_name("siblings.csv")
 EPISODES = 64
 STEPS = 40
 """Steps at 2 Hz taken of an episode, at most."""
@@ -135,7 +137,7 @@ def gain(control: Sequence[np.ndarray], own: Sequence[np.ndarray]) -> tuple[floa
     return i.mean, i.low, i.high
 
 
-def compare_families(out: Annotated[Path, arg(metavar="FILE")] = OUT) -> None:
+def compare_families(out: Annotated[Path, arg(metavar="FILE", help_behavior_hint=COMMITTED)] = OUT) -> None:
     """Judges all families and writes a table.
 
     Args:
@@ -149,14 +151,11 @@ def compare_families(out: Annotated[Path, arg(metavar="FILE")] = OUT) -> None:
         gains = [f"{v:.4f}" for v in (*r.over_strangers, *r.over_shuffled)]
         rows.append([family, f"{r.siblings:.4f}", f"{r.strangers:.4f}", f"{r.shuffled:.4f}", *gains])
         print(*rows[-1], sep="\t", flush=True)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([
-            "family", "siblings", "strangers", "shuffled", "over_strangers", "over_strangers_low", "over_strangers_high",
-            "over_shuffled", "over_shuffled_low", "over_shuffled_high",
-        ])  # fmt: skip
-        writer.writerows(rows)
+    names = [
+        "family", "siblings", "strangers", "shuffled", "over_strangers", "over_strangers_low", "over_strangers_high",
+        "over_shuffled", "over_shuffled_low", "over_shuffled_high",
+    ]  # fmt: skip
+    write_table(out, names, rows)
 
 
 def _padded(spec: EmbodimentSpec) -> int:

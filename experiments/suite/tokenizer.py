@@ -1,5 +1,5 @@
 """Question: how well does a tokenizer reconstruct the suite, and what moves in it?
-Command: python -m experiments.suite.tokenizer RUN [--out experiments/results/suite/tokenizer.csv]
+Command: python -m experiments.suite.tokenizer RUN [--out FILE]
 Cost: about half a minute of one core, after `hma tokenizer train --preset cpu --out RUN`.
 
 Pairs of frames half a second apart, from the validation split of every robot in RUN/suite: PSNR of the later frame, and
@@ -8,7 +8,6 @@ of those of its pixels that changed noticeably.
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -19,11 +18,14 @@ from tyro.conf import Positional, arg
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.images import fit_image
+from experiments.analysis.explained_share import EXPLAINED
+from experiments.suite import COMMITTED
+from experiments.tables import write_table
 from experiments.terminal.command_line import run_module
 from experiments.terminal.exit_code import exit_code_of
 from hma_jax.tokenizers.io import load_tokenizer
 
-OUT = Path("experiments/results/suite/tokenizer.csv")
+OUT = EXPLAINED.with_name("tokenizer.csv")
 PAIRS = 48
 """Per robot, spread evenly over its validation episodes."""
 
@@ -56,7 +58,7 @@ def quality(decoded: np.ndarray, pairs: np.ndarray) -> tuple[float, float, float
 
 def measure_run(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
-    out: Annotated[Path, arg(metavar="FILE")] = OUT,
+    out: Annotated[Path, arg(metavar="FILE", help_behavior_hint=COMMITTED)] = OUT,
 ) -> None:
     """Measures the tokenizer of a run and writes a table.
 
@@ -70,11 +72,8 @@ def measure_run(
         decoded = tokenizer.reconstruct(pairs[:, 1])
         rows.append([directory.name, *quality(decoded, pairs)])
     rows.append(["mean", *np.mean([row[1:] for row in rows], 0)])
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["robot", "psnr", "psnr_changed", "changed"])
-        writer.writerows([name, *(f"{value:.3f}" for value in values)] for name, *values in rows)
+    cells = [[name, *(f"{value:.3f}" for value in values)] for name, *values in rows]
+    write_table(out, ["robot", "psnr", "psnr_changed", "changed"], cells)
     print(
         f"{rows[-1][1]:.2f} dB on held-out frames, {rows[-1][2]:.2f} dB on the {rows[-1][3]:.0%} of pixels that change"
     )

@@ -11,8 +11,10 @@ import pytest
 from data_pipelines.suite.embodiments import EMBODIMENTS, siblings
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.world import World
-from experiments.analysis.explained_share import read_shares
+from experiments.analysis.explained_share import EXPLAINED, read_shares
 from experiments.suite import explained as explained_module
+from experiments.suite import siblings as siblings_module
+from experiments.suite import tokenizer as tokenizer_module
 from experiments.suite.clips import animation, clip
 from experiments.suite.explained import explained
 from experiments.suite.siblings import OUT, Samples, gain, judge, predictor, sample
@@ -24,6 +26,12 @@ BY_NAME = {s.name: s for s in EMBODIMENTS}
 def sibling_rows() -> dict[str, dict[str, str]]:
     with OUT.open(newline="") as file:
         return {row["family"]: row for row in csv.DictReader(file)}
+
+
+def test_the_committed_tables_are_the_defaults_in_any_working_directory(tmp_path, monkeypatch):
+    """Two commands wrote a table below the directory in which they were started."""
+    monkeypatch.chdir(tmp_path)
+    assert all(table.is_file() for table in (EXPLAINED, siblings_module.OUT, tokenizer_module.OUT))
 
 
 def test_actions_explain_enough_of_what_changes():
