@@ -25,7 +25,7 @@ from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.windows import WindowTable
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BestSteps:
     """A point judged at the number of steps chosen on other episodes; `chosen` lists numbers and how often each was
     chosen, 'steps x times'.
@@ -87,9 +87,11 @@ def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]
         panel = make_panel([composed], metric, sweep.scope)
         if lacks_numbers(metric, np.concatenate(panel.points)).any() or not panel.known.any():
             continue
-        (i,) = bootstrap_intervals(panel.rows(panel.known))
+        (interval,) = bootstrap_intervals(panel.rows(panel.known))
         rows.append(
-            BestSteps(sweep.name, x, metric, i.mean, i.sem, i.low, i.high, len(seeds), i.n, i.episodes, listed, edge)
+            BestSteps(
+                sweep=sweep.name, x=x, metric=metric, seeds=len(seeds), chosen=listed, edge=edge, **vars(interval)
+            )
         )
     return rows
 

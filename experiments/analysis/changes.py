@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.analysis.compare import Difference, Side, overall_difference
-from experiments.analysis.intervals import critical, standard_errors
+from experiments.analysis.intervals import Interval, critical
 from experiments.analysis.paired import NoNumbers
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
@@ -26,7 +26,7 @@ CHANGED = ("cross_entropy", "action_nats", "delta_psnr")
 OF_VARIANTS = ("cross_entropy", "diffusion_loss", "delta_psnr", "action_error")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Change:
     """The mean at `last` minus that at `first`, over robots, with its interval; `seeds`: those that both ends have."""
 
@@ -106,8 +106,9 @@ def _change(sweep: Sweep, series: str, ends: Ends, metric: str) -> Change | None
     if d is None:
         return None
     return Change(
-        sweep.name, series, first, last, metric, d.mean, d.sem, d.low, d.high, d.errors, d.seeds, d.n, d.episodes
-    )
+        sweep=sweep.name, series=series, first=first, last=last, metric=metric, errors=d.errors, seeds=d.seeds,
+        **vars(d.interval),
+    )  # fmt: skip
 
 
 def _over_seeds(a: Side, b: Side, metric: str, scopes: Mapping[int, Sequence[str]]) -> Difference | None:
@@ -126,8 +127,8 @@ def _over_seeds(a: Side, b: Side, metric: str, scopes: Mapping[int, Sequence[str
     mean, sem = float(means.mean()), float(means.std(ddof=1) / math.sqrt(len(means)))
     half = critical(len(means) - 1) * sem
     at_a, at_b = (float(np.mean([getattr(d, side) for d in known])) for side in "ab")
+    windows, episodes = sum(d.n for d in known), sum(d.episodes for d in known)
+    interval = Interval(mean, sem, mean - half, mean + half, windows, episodes)
     return Difference(
-        known[0].scope, metric, at_a, at_b, mean, sem, mean - half, mean + half,
-        standard_errors(mean, sem), len(known),
-        sum(d.n for d in known), sum(d.episodes for d in known),
-    )  # fmt: skip
+        scope=known[0].scope, metric=metric, a=at_a, b=at_b, errors=interval.errors, seeds=len(known), **vars(interval)
+    )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals, make_panel
-from experiments.analysis.intervals import NATS, OVERALL, Interval, interval_of, nats_first, overall
+from experiments.analysis.intervals import NATS, OVERALL, UNKNOWN, Interval, interval_of, nats_first, overall
 from experiments.analysis.paired import NoNumbers, NotComparable, require_same_windows
 from hma_jax.evaluation.measures import OF_TOKENS, OF_WINDOWS, OPTIONAL_METRICS
 from hma_jax.evaluation.statistics import mean_and_sem
@@ -33,7 +33,7 @@ class Side:
     noising_steps: int = 0  # steps of the noising process of a model on latents; 0: on ids, or unknown
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Difference:
     """a - b for one metric, over one robot or all, with its interval; for nats also the ratio of perplexities."""
 
@@ -52,6 +52,10 @@ class Difference:
     ratio: float = float("nan")  # exp(mean): the perplexity of a over that of b
     ratio_low: float = float("nan")
     ratio_high: float = float("nan")
+
+    @property
+    def interval(self) -> Interval:
+        return Interval(self.mean, self.sem, self.low, self.high, self.n, self.episodes)
 
 
 def compare(a: Side, b: Side) -> list[Difference]:
@@ -178,11 +182,11 @@ def _of_metric(metric: str, a: Panel, b: Panel) -> list[Difference]:
 def _difference(scope: str, metric: str, a: Panel, b: Panel) -> Difference:
     interval = _interval(a.minus(b))
     robots = dict.fromkeys(a.robot.tolist())
-    means = (float(np.mean([p.points[0][:, p.robot == robot].mean() for robot in robots])) for p in (a, b))
-    ratio = interval.exp() if metric in NATS[:1] else None
+    of_a, of_b = (float(np.mean([p.points[0][:, p.robot == robot].mean() for robot in robots])) for p in (a, b))
+    ratio = interval.exp() if metric in NATS[:1] else UNKNOWN
     return Difference(
-        scope, metric, *means, interval.mean, interval.sem, interval.low, interval.high, interval.errors,
-        len(a.seeds[0]), interval.n, interval.episodes, *((ratio.mean, ratio.low, ratio.high) if ratio else ()),
+        scope=scope, metric=metric, a=of_a, b=of_b, errors=interval.errors, seeds=len(a.seeds[0]), **vars(interval),
+        ratio=ratio.mean, ratio_low=ratio.low, ratio_high=ratio.high,
     )  # fmt: skip
 
 

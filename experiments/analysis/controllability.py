@@ -37,7 +37,7 @@ ROUNDING = 1e-5
 it would look significant."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Controllability:
     """A line of the table; `mean` minus `deaf` is `errors` standard errors from zero."""
 
@@ -111,7 +111,7 @@ def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, 
     errors = standard_errors(0.0 if abs(excess) < ROUNDING else excess, interval.sem)
     return (
         Controllability(
-            robot, metric, interval.mean, interval.sem, interval.low, interval.high, deaf, errors, len(tables), interval.n,
-            interval.episodes, share, role,
+            robot=robot, metric=metric, deaf=deaf, errors=errors, seeds=len(tables), explained=share, role=role,
+            **vars(interval),
         ),
     )  # fmt: skip

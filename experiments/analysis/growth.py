@@ -26,7 +26,7 @@ from hma_jax.evaluation.windows import WindowTable
 GROWS, EXHAUSTED = "grows", "exhausted"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Growth:
     """The mean at `last` minus that at `first`, over the robots whose data grows between them, or over those whose data
     is exhausted."""
@@ -104,8 +104,8 @@ def _along(
                 if d is not None:
                     found.append(
                         Growth(
-                            sweep.name, series, first, last, data, len(robots), metric, d.mean, d.sem, d.low, d.high,
-                            d.seeds, d.n, d.episodes,
+                            sweep=sweep.name, series=series, first=first, last=last, data=data, robots=len(robots),
+                            metric=metric, seeds=d.seeds, **vars(d.interval),
                         )
                     )  # fmt: skip
     return found

@@ -70,6 +70,9 @@ class Interval:
         return Interval(mean, self.sem * mean, _exp(self.low), _exp(self.high), self.n, self.episodes)
 
 
+UNKNOWN = Interval(math.nan, math.nan, math.nan, math.nan)
+
+
 def standard_errors(mean: float, sem: float) -> float:
     """How many standard errors a mean is from zero; 0 if it is exactly zero, nan for an unknown error."""
     if mean == 0:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
-from experiments.analysis.intervals import Interval
+from experiments.analysis.intervals import UNKNOWN, Interval
 from experiments.applications.judging.agreement import rate_interval
 from experiments.tables import write_table
 
@@ -60,8 +60,6 @@ CONTROLS = (CONTROL, PASSIVE, GIVEN)
 
 SHARES = {i: CONDITIONS[i].name.removeprefix("10 + 90, ") for i in (MOST, *CONTROLS)}
 """What each share is called."""
-
-UNKNOWN = Interval(math.nan, math.nan, math.nan, math.nan)
 
 
 def tried_conditions(trials: Trials) -> list[int]:
