@@ -38,8 +38,9 @@ def group_by_dataset(data: Sequence[str]) -> dict[str, dict[str, str]]:
         require(
             name not in places,
             f"--data: {places.get(name)} and {place} are both the dataset {name!r}, by the name in their files; a "
-            "study reads one directory per name: leave one out or, if it is a LeRobot folder, which has no other name "
-            "than its folder's, rename it; an entry with `joins` makes one dataset of both",
+            "study reads one place per name: leave one out, or give it another name (a LeRobot folder: rename it; a "
+            "robomimic file: `hma data convert robomimic FILE --out DIR --name NAME` writes it under that name); then "
+            "an entry with `joins` can make one dataset of both",
         )
         places[name] = place
         entry = find_reader(name)

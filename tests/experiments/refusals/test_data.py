@@ -218,6 +218,7 @@ def test_two_directories_of_one_dataset(arm, tmp_path, refused):
     other = shutil.copytree(arm, tmp_path / "corrected")
     message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, other)
     assert f"{arm} and {other} are both the dataset {ARM.name!r}" in message and "leave one out" in message
+    assert "`hma data convert robomimic FILE --out DIR --name NAME`" in message  # with one name, `joins` cannot help
 
 
 # --- Windows ---------------------------------------------------------------------------------
