@@ -45,7 +45,7 @@ class EpisodeEntry:
     tasks: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # as a key it is itself: `read_meta` gives the same one while no file changes
 class LeRobotMeta:
     """`features` as info.json has them; `tasks` by task_index.
 
@@ -137,7 +137,11 @@ def hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
     """SHA-256, to which more can be added, of what is read from the meta folder: the rate, the features, and for every
     episode its place, length and statistics. No reader needs the statistics, but they change with the episode's actions
     and images. If single episodes have none, those of the whole dataset are used."""
+    return _hash_episodes(root, meta).copy()
 
+
+@functools.lru_cache(8)  # statistics of a million episodes take minutes
+def _hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
     def place(path: Path) -> str:
         return path.relative_to(root).as_posix()
 
