@@ -176,17 +176,19 @@ def frame_diffusion_loss(
     """Per token [B, T, S]: squared error of the noise plus the bound's variance term (reference section 2.4).
 
     The distribution of steps, and the weight of the error at each, are configurable only for `training`
-    (`DiffusionConfig.time_shift`, `weight_cap`), so that all models are judged in the same way.
+    (`DiffusionConfig.noise_shift`, `weight_cap`), so that all models with as many noising steps are judged in the same
+    way.
     """
     config = model.config.diffusion
     process = make_process(config.steps)
-    shift, cap = (config.time_shift, config.weight_cap) if training else (1.0, 0.0)
+    shifts = (config.noise_shift, config.time_shift) if training else (1.0, 1.0)
+    cap = config.weight_cap if training else 0.0
 
     x0 = tokens_BTSC.astype(jnp.float32)
 
     def noised_copy(r: int) -> jax.Array:
         keys = fold_in_each(key_B, r)
-        time, noise = jax.vmap(lambda key: draw_noise(key, x0.shape[1:], config.steps, shift))(keys)
+        time, noise = jax.vmap(lambda key: draw_noise(key, x0.shape[1:], config.steps, *shifts))(keys)
         mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z_BTSD), x0, time, noise, process)
         if cap:
             mse *= jnp.asarray(process.noise_over_signal(cap), jnp.float32)[time]
@@ -196,13 +198,21 @@ def frame_diffusion_loss(
     return jnp.stack([noised_copy(r) for r in range(config.repeats)]).mean(axis=0)
 
 
-def draw_noise(key: jax.Array, shape: tuple[int, ...], steps: int, shift: float = 1.0) -> tuple[jax.Array, jax.Array]:
-    """(time int [...], noise [..., C]) for values of `shape` [..., C]; `shift` as `DiffusionConfig.time_shift`."""
+def draw_noise(
+    key: jax.Array, shape: tuple[int, ...], steps: int, noise_shift: float = 1.0, time_shift: float = 1.0
+) -> tuple[jax.Array, jax.Array]:
+    """(time int [...], noise [..., C]) for values of `shape` [..., C]; the shifts as in `DiffusionConfig`."""
     time_key, noise_key = jax.random.split(key)
-    time = jax.random.randint(time_key, shape[:-1], 0, steps, jnp.int32)
-    if shift != 1:
-        u = (time + 0.5) / steps
-        time = (steps * shift * u / (1 + (shift - 1) * u)).astype(jnp.int32)
+
+    def shifted(u: jax.Array, shift: float) -> jax.Array:
+        return jnp.minimum(steps * shift * u / (1 + (shift - 1) * u), steps - 1).astype(jnp.int32)
+
+    if noise_shift != 1:
+        time = shifted(jax.random.uniform(time_key, shape[:-1]), noise_shift)
+    else:
+        time = jax.random.randint(time_key, shape[:-1], 0, steps, jnp.int32)
+        if time_shift != 1:
+            time = shifted((time + 0.5) / steps, time_shift)
     return time, draw_flat(jax.random.normal, noise_key, shape)
 
 

@@ -280,6 +280,21 @@ def test_shifted_steps_are_drawn_as_often_as_the_shift_says():
             want = share / (k - (k - 1) * share)
             assert abs(float(np.mean(np.asarray(time) < 100 * share)) - want) < 0.02, (k, share)
         np.testing.assert_array_equal(noise, draw_noise(key, shape, 100)[1])
-    # The middles of four steps, at 3 u / (1 + 2 u): 1.2, 2.6, 3.3 and 3.8 of four.
-    time = np.asarray(draw_noise(key, shape, 4, 3.0)[0])
+
+
+@pytest.mark.parametrize("k", [0.25, 4.0, 8.0])
+def test_every_step_is_drawn_whatever_the_shift(k):
+    """At 4 a third of 1000 steps never was, among them the first, with which every sampler ends."""
+    time = np.asarray(draw_noise(jax.random.key(0), (1_000_000, 1), 1000, k)[0])
+    edges = np.arange(1001) / 1000
+    want = len(time) * np.diff(edges / (k - (k - 1) * edges))
+    assert (np.abs(np.bincount(time, minlength=1000) - want) < 6 * np.sqrt(want)).all() and want.min() > 50
+    assert np.asarray(draw_noise(jax.random.key(0), (1000, 1), 1000, 1e30)[0]).max() == 999
+
+
+def test_the_former_shift_still_draws_as_it_did():
+    """The middles of four steps, at 3 u / (1 + 2 u): 1.2, 2.6, 3.3 and 3.8 of four."""
+    time = np.asarray(draw_noise(jax.random.key(0), (20_000, 1), 4, time_shift=3.0)[0])
     np.testing.assert_allclose(np.bincount(time, minlength=4) / len(time), [0, 1 / 4, 1 / 4, 1 / 2], atol=0.02)
+    with pytest.raises(ConfigError, match="time_shift is the former diffusion.noise_shift; set only one"):
+        DiffusionConfig(noise_shift=4.0, time_shift=4.0)

@@ -235,7 +235,7 @@ def test_the_gradient_of_actions_counts_as_their_loss_does(monkeypatch):
 
 
 def test_only_in_training_are_latents_noised_and_weighed_as_it_is_configured(monkeypatch):
-    """Under `weight_cap` and `time_shift`; held-out losses of models that were trained otherwise are comparable."""
+    """Under `weight_cap` and `noise_shift`; held-out losses of models that were trained otherwise are comparable."""
     config, masking, seen = shallow_config(diffusion=DIFFUSION), MaskingConfig(), []
 
     def frame_loss(model, z_BTSD, tokens_BTSC, key_B, training=False):

@@ -150,7 +150,7 @@ FORCED = MaskingConfig(teacher_forcing=True)
         pytest.param(None, None, replace(FORCED, change_weight=3.0), id="weighed ids"),
         pytest.param(None, None, replace(FORCED, own_past=0.5, own_past_rounds=2), id="own past"),
         pytest.param(None, None, replace(FORCED, displaced_past=0.5), id="displaced past"),
-        pytest.param(DIFFUSION, replace(DIFFUSION, weight_cap=5.0, time_shift=4.0), FORCED, id="weighed noise"),
+        pytest.param(DIFFUSION, replace(DIFFUSION, weight_cap=5.0, noise_shift=4.0), FORCED, id="weighed noise"),
     ],
 )
 def test_what_weighs_or_degrades_in_training_alone_changes_no_held_out_loss(diffusion, trained, masking):
