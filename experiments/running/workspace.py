@@ -90,10 +90,16 @@ class Workspace:
 
     @classmethod
     def of_run(cls, run: Path) -> Workspace:
-        """The study to which a run belongs: STUDY/RUN, or the trial STUDY/trials/ID/run."""
-        parent = run.absolute().parent
-        study = parent.parent.parent
-        return cls(study if cls(study).trials == parent.parent else parent)
+        """The study to which a run belongs: STUDY/RUN, or the trial STUDY/trials/ID/run. A link to a run belongs to the
+        study in which the run lies, or else, as for runs on another disk, to that in which the link lies."""
+        if run.is_symlink() and (study := cls._around(run.resolve())).tokenizer.is_dir():
+            return study
+        return cls._around(run.absolute())
+
+    @classmethod
+    def _around(cls, run: Path) -> Workspace:
+        study = run.parent.parent.parent
+        return cls(study if cls(study).trials == run.parent.parent else run.parent)
 
     @property
     def holder(self) -> Holder | None:

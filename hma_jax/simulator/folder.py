@@ -38,8 +38,10 @@ the denoiser than in evaluation."""
 
 
 def find_tokenizer(directory: Path, run: Run, given: Path | None) -> Tokenizer:
-    """The tokenizer whose tokens the run was trained on. Raises ConfigError if there is none, or a different one."""
-    places = [Path(given)] if given else [directory / TOKENIZER, directory.absolute().parent / TOKENIZER]
+    """The tokenizer whose tokens the run was trained on; of a link to a run, that beside the run before that beside the
+    link. Raises ConfigError if there is none, or a different one."""
+    homes = [directory.resolve().parent] * directory.is_symlink() + [directory.absolute().parent]
+    places = [Path(given)] if given else [directory / TOKENIZER, *(home / TOKENIZER for home in homes)]
     found = [place for place in places if place.is_dir()]
     require(
         bool(found),

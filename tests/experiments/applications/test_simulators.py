@@ -87,6 +87,19 @@ def test_a_trial_of_a_study_has_the_study_s_tokenizer(run, tmp_path):
     assert dict(load_simulator(trial).robots) == dict(load_simulator(run).robots)
 
 
+def test_a_link_to_a_run_leads_to_its_study(run, tmp_path):
+    """There was no tokenizer, or the ranges of actions were those of statistics."""
+    study, other = tmp_path / "study", tmp_path / "other"
+    shutil.copytree(run.parent / "tokenizer", study / "tokenizer")
+    for place in (other / "tokenizer", tmp_path / "disk" / "model"):
+        place.mkdir(parents=True)
+    shutil.copytree(run, study / "model")
+    for link, to in ((tmp_path / "best", study), (other / "best", study), (study / "big", tmp_path / "disk")):
+        link.symlink_to(to / "model")
+        assert Workspace.of_run(link) == Workspace(study)
+    assert Simulator.load(other / "best").tokenizer.identity == Simulator.load(study / "model").tokenizer.identity
+
+
 def test_one_robot_that_is_given_leaves_the_others_and_what_is_not_given_as_they_lie_beside_the_run(run, tmp_path):
     """All lost what robots.json says of them, and `decode=None` was another way to decode than decode.json's."""
     study = shutil.copytree(run.parent, tmp_path / "study")
