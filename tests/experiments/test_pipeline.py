@@ -24,8 +24,7 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     study = override(get_preset("smoke-continuous"), ["dataset_counts=1"])
     workspace, model = Workspace(tmp_path), study.model
     monkeypatch.setattr("experiments.preparing.tokenizer.QUALITY_FRAMES", 8)
-    prepare(study, workspace)
-    prepared = open_prepared_data(workspace)
+    prepared = open_prepared_data(workspace, prepare(study, workspace))  # as a trial, which compares them
     store = prepared.store
     table = store.embodiment_table(study.dataset_names(), rate=2.0)
     loader = make_loader(store, table, LoaderConfig(frames=model.frames, batch=2))
