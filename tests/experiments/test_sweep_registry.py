@@ -239,8 +239,7 @@ def test_a_whole_number_in_a_field_of_floats_gives_a_trial_no_other_name(tmp_pat
             "trial at 1 caps trajectories of .* at no number; set max_trajectories",
         ),
         (OWN.format("replace(trial, tau=2.0 + x)"), r"does not stand at reference_x 3, .* \(tau: 3.0 -> 5.0\)"),
-        (OWN.format("replace(trial, tau='3' if x == 1 else 3.0)"), "trial at 1 has a setting of a wrong type .*tau"),
-        (OWN.format("replace(trial, datasets=list(trial.datasets)) if x == 1 else trial"), "a list instead of a tuple"),
+        (OWN.format("replace(trial, tau='3' if x == 1 else 3.0)"), "Trial.tau: expected float, got '3'"),
         (
             OWN.format("replace(trial, datasets=trial.datasets[:x])"),
             "trial at 1 evaluates rover, pusher, but is not trained",
@@ -275,6 +274,7 @@ def test_a_whole_number_in_a_field_of_floats_gives_a_trial_no_other_name(tmp_pat
         (EDITED.format("x=0") + LABELLED, "reference_x is 16, but .* with labels .* the default, from 0 to 0"),
         ("from experiments.sweeps.width import plan", "'width' is taken"),
         (NAMED.replace('"own"', "3"), "the sweep has a setting of a wrong type .Sweep.name: expected str, got 3"),
+        (EDITED.format("scope=['rover']"), "trial at 8 has a setting of a wrong type: a list instead of a tuple"),
         (EDITED.format("scope=3"), "trial at 8 has a setting of a wrong type .Point.scope: expected a list, got 3"),
         (TWICE, "returned 2 points at 8, point, seed 0; give each a position or a series of its own"),
     ],

@@ -65,7 +65,7 @@ def edit_page(monkeypatch, old: str, new: str) -> None:
 
     page = files("experiments.applications.play").joinpath("page.html").read_text()
     assert old in page
-    edited = SimpleNamespace(joinpath=lambda _: SimpleNamespace(read_text=lambda: page.replace(old, new)))
+    edited = SimpleNamespace(joinpath=lambda _: SimpleNamespace(read_text=lambda **_: page.replace(old, new)))
     monkeypatch.setattr(server, "files", lambda _: edited)
 
 
