@@ -212,7 +212,7 @@ CPU_CONTINUOUS = replace(
     # With the released settings, actions are hardly followed: their loss gives most weight to noise so small that the
     # frame shows through it.
     model=replace(
-        CPU.model, diffusion=DiffusionConfig(channels=16, patch=1, width=48, depth=2, weight_cap=20.0, noise_shift=4.0)
+        CPU.model, diffusion=DiffusionConfig(channels=16, patch=1, width=48, depth=2, weight_cap=20.0, time_shift=4.0)
     ),
     eval=replace(CPU.eval, decode=DecodeConfig(sampler=SamplerConfig(kind="dpm++", steps=12, temperature=0.0))),
 )

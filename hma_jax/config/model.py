@@ -48,11 +48,11 @@ class DiffusionConfig:
     # above 0, noise over signal, at most this (squared error of the clean vector, so noisy steps count most).
     weight_cap: float = later(0.0)
     # Shift k of the noising steps that are drawn in training: 1, uniform, as released; larger, towards noise (a uniform
-    # position u becomes k u / (1 + (k - 1) u); Esser et al. 2024).
-    noise_shift: float = later(1.0)
-    # The former noise_shift, only to repeat trials that have it. It moves whole steps: many are never drawn (of 1000 a
-    # third at k = 4, among them the first, with which every sampler ends).
+    # position u becomes k u / (1 + (k - 1) u); Esser et al. 2024). Whole steps are moved, so many are never drawn (of
+    # 1000 a third at k = 4, among them the first, with which every sampler ends).
     time_shift: float = later(1.0)
+    # The same shift of the position before it becomes a step: every step is drawn. Not measured to be better.
+    noise_shift: float = later(1.0)
 
     def __post_init__(self):
         check_fields(self, infinite_allowed=("clip", "weight_cap"))
@@ -66,7 +66,7 @@ class DiffusionConfig:
             require(getattr(self, name) > 0, f"diffusion.{name} must be positive, got {getattr(self, name)}")
         require(
             1 in (self.noise_shift, self.time_shift),
-            "diffusion.time_shift is the former diffusion.noise_shift; set only one of them, the other to 1",
+            "diffusion.time_shift and diffusion.noise_shift are two ways of one shift; set only one of them, the other to 1",
         )
 
     @property

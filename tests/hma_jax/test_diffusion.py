@@ -292,9 +292,9 @@ def test_every_step_is_drawn_whatever_the_shift(k):
     assert np.asarray(draw_noise(jax.random.key(0), (1000, 1), 1000, 1e30)[0]).max() == 999
 
 
-def test_the_former_shift_still_draws_as_it_did():
+def test_a_shift_of_whole_steps_draws_their_middles():
     """The middles of four steps, at 3 u / (1 + 2 u): 1.2, 2.6, 3.3 and 3.8 of four."""
     time = np.asarray(draw_noise(jax.random.key(0), (20_000, 1), 4, time_shift=3.0)[0])
     np.testing.assert_allclose(np.bincount(time, minlength=4) / len(time), [0, 1 / 4, 1 / 4, 1 / 2], atol=0.02)
-    with pytest.raises(ConfigError, match="time_shift is the former diffusion.noise_shift; set only one"):
+    with pytest.raises(ConfigError, match="two ways of one shift; set only one"):
         DiffusionConfig(noise_shift=4.0, time_shift=4.0)
