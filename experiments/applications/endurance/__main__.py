@@ -10,6 +10,7 @@ variant, a sheet of frames with the truth above. A detector is needed (experimen
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -130,29 +131,28 @@ def drive_run(
         driven = select_robots(native_robots(simulator.robots), robots)
         begins = true_starts_of(simulator, driven, starts)
         pin_name(out, name, run, simulator, detector)
-        for kind in drives:
-            for variant in variants:
-                new: list[Row] = []
-                for which in range(starts):
-                    path = film_path(out, name, variant, kind, minutes, which, robots)
-                    unfinished = path.with_name(f"{path.name}.unfinished")
-                    if not path.exists():
-                        with step(f"{variant}, {kind}, {minutes:g} min, start {which}") as update:
-                            told = [
-                                make_drive(robot, begins[key][which], round(60 * minutes * robot.hz), kind, which)
-                                for key, robot in driven.items()
-                            ]
-                            filmed = load_variant(run, variant, len(driven))
-                            save_films(make_films(filmed, finder, told, unfinished, update), path)
-                    unfinished.unlink(missing_ok=True)
-                    films = load_films(path)
-                    hz = {key: SPECS[key].hz for key in films}
-                    tools = {key: len(SPECS[key].body.tools) for key in films}
-                    new += rows_of(f"{name}/{variant}", kind, which, films, hz, tools, every)
-                print_rows(new)
-                rows += new
-                draw_sheet(films, out / f"{'-'.join([name, variant, kind, *robots])}.png")
-                console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
+        for kind, variant in itertools.product(drives, variants):
+            new: list[Row] = []
+            for which in range(starts):
+                path = film_path(out, name, variant, kind, minutes, which, robots)
+                unfinished = path.with_name(f"{path.name}.unfinished")
+                if not path.exists():
+                    with step(f"{variant}, {kind}, {minutes:g} min, start {which}") as update:
+                        told = [
+                            make_drive(robot, begins[key][which], round(60 * minutes * robot.hz), kind, which)
+                            for key, robot in driven.items()
+                        ]
+                        filmed = load_variant(run, variant, len(driven))
+                        save_films(make_films(filmed, finder, told, unfinished, update), path)
+                unfinished.unlink(missing_ok=True)
+                films = load_films(path)
+                hz = {key: SPECS[key].hz for key in films}
+                tools = {key: len(SPECS[key].body.tools) for key in films}
+                new += rows_of(f"{name}/{variant}", kind, which, films, hz, tools, every)
+            print_rows(new)
+            rows += new
+            draw_sheet(films, out / f"{'-'.join([name, variant, kind, *robots])}.png")
+            console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
         curves = (out / table).with_suffix(".png")
         write_rows(out / table, rows)
         draw_curves([row for row in rows if row["drive"] == drives[0]], curves)
