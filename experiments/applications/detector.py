@@ -33,6 +33,7 @@ from data_pipelines.suite.spec import IMAGE_SIZE
 from experiments.applications.detector_network import Detections, DetectorParams, detect, init_detector, points_loss
 from experiments.applications.scenes import Points, Scenes, draw_scenes, point_names
 from experiments.applications.settings_file import FILE, pin_settings
+from experiments.running.workspace import Workspace
 from experiments.simulators import load_simulator
 from experiments.tables import write_rows
 from experiments.terminal.command_line import run_module
@@ -288,20 +289,21 @@ def train_for_run(
         run: Directory of a training run.
         out: Directory for the detector.
     """
-    simulator, weights, table = load_simulator(run), out / WEIGHTS, out / ERRORS
-    robots = list(suite_robots(simulator.robots))
-    require(
-        not weights.exists() or (out / FILE).exists(),
-        f"{weights} exists, but it is not known for which run it was trained; choose another --out or remove it",
-    )
-    pin_settings(out, run, simulator, unused=("simulator.decode",))  # no frame is made
-    if existing := weights.exists():
-        say(f"{short(weights)} of this run exists already; remove it to train it again")
-    else:
-        make_detector(robots, simulator.tokenizer, out)
-    print(table.read_text())
-    then = f"python -m experiments.applications.endurance {run} --detector {weights}"
-    wrote(*(() if existing else (weights, table)), then=then)
+    with Workspace(out).locked():
+        simulator, weights, table = load_simulator(run), out / WEIGHTS, out / ERRORS
+        robots = list(suite_robots(simulator.robots))
+        require(
+            not weights.exists() or (out / FILE).exists(),
+            f"{weights} exists, but it is not known for which run it was trained; choose another --out or remove it",
+        )
+        pin_settings(out, run, simulator, unused=("simulator.decode",))  # no frame is made
+        if existing := weights.exists():
+            say(f"{short(weights)} of this run exists already; remove it to train it again")
+        else:
+            make_detector(robots, simulator.tokenizer, out)
+        print(table.read_text())
+        then = f"python -m experiments.applications.endurance {run} --detector {weights}"
+        wrote(*(() if existing else (weights, table)), then=then)
 
 
 def main() -> None:

@@ -38,6 +38,7 @@ from experiments.applications.policies.tasks import join
 from experiments.applications.scenes import Points, point_names, points_of
 from experiments.applications.settings_file import pin_settings
 from experiments.running.run_options import UNSET
+from experiments.running.workspace import Workspace
 from experiments.simulators import START_FRAMES, held_out, load_simulator, true_simulator
 from experiments.tables import write_rows
 from experiments.terminal.command_line import run_module
@@ -121,30 +122,35 @@ def measure_run(
         out: Directory for the table and the detector.
         robots: Only these robots; without it all robots of the run that the suite can simulate.
     """
-    options = {"execution": ExecutionConfig(remat="none"), "episodes": EPISODES, "history": 1}
-    simulator = load_simulator(run, **options)
-    chosen, weights = select_robots(suite_robots(simulator.robots), robots), out / WEIGHTS
-    settings = {"robots": sorted(chosen)} if robots else {}
-    pin_settings(out, run, simulator, settings)  # a detector is trained on frames as one tokenizer shows them
-    if not weights.exists():
-        make_detector(list(chosen), simulator.tokenizer, out)
-    detector, rows, short = Detector.load(weights), [], []
-    with step("held-out episodes") as update:
-        for i, robot in enumerate(chosen.values()):
-            new = measure_ends(simulator, detector, robot)
-            short += [] if new else [robot.name]
-            rows += new
-            update(i + 1, len(chosen), robot.name)
-    if short:
-        console.print(f"left out, since their episodes are too short or show no object at the end: {', '.join(short)}")
-    require(bool(rows), "no robot is left; choose other --robots, or a model with a shorter window")
-    write_rows(out / TABLE, rows)
-    for kind, prefix in (("tools and objects", ""), ("tools", "tool"), ("objects", "colour")):
-        own_rows = [row for row in rows if str(row["what"]).startswith(prefix)]
-        shares = {view: in_place(own_rows, view) for view in VIEWS}
-        words = [f"{view} {share:.3f} ± {half:.3f}" for view, (share, half, _) in shares.items()]
-        console.print(f"{kind} that moved, in place ({shares['true'][2]} robots): {', '.join(words)}", soft_wrap=True)
-    wrote(out / TABLE)
+    with Workspace(out).locked():
+        options = {"execution": ExecutionConfig(remat="none"), "episodes": EPISODES, "history": 1}
+        simulator = load_simulator(run, **options)
+        chosen, weights = select_robots(suite_robots(simulator.robots), robots), out / WEIGHTS
+        settings = {"robots": sorted(chosen)} if robots else {}
+        pin_settings(out, run, simulator, settings)  # a detector is trained on frames as one tokenizer shows them
+        if not weights.exists():
+            make_detector(list(chosen), simulator.tokenizer, out)
+        detector, rows, short = Detector.load(weights), [], []
+        with step("held-out episodes") as update:
+            for i, robot in enumerate(chosen.values()):
+                new = measure_ends(simulator, detector, robot)
+                short += [] if new else [robot.name]
+                rows += new
+                update(i + 1, len(chosen), robot.name)
+        if short:
+            console.print(
+                f"left out, since their episodes are too short or show no object at the end: {', '.join(short)}"
+            )
+        require(bool(rows), "no robot is left; choose other --robots, or a model with a shorter window")
+        write_rows(out / TABLE, rows)
+        for kind, prefix in (("tools and objects", ""), ("tools", "tool"), ("objects", "colour")):
+            own_rows = [row for row in rows if str(row["what"]).startswith(prefix)]
+            shares = {view: in_place(own_rows, view) for view in VIEWS}
+            words = [f"{view} {share:.3f} ± {half:.3f}" for view, (share, half, _) in shares.items()]
+            console.print(
+                f"{kind} that moved, in place ({shares['true'][2]} robots): {', '.join(words)}", soft_wrap=True
+            )
+        wrote(out / TABLE)
 
 
 def main() -> None:

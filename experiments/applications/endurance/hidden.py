@@ -33,6 +33,7 @@ from experiments.applications.endurance.drives import native_robots
 from experiments.applications.endurance.settings import pin_name
 from experiments.applications.endurance.tables import Row
 from experiments.applications.scenes import VISIBLE_SHARE, points_of
+from experiments.running.workspace import Workspace
 from experiments.simulators import START_FRAMES, load_simulator
 from experiments.tables import write_rows
 from experiments.terminal.command_line import run_module
@@ -159,31 +160,32 @@ def measure_hidden(
         name: Name of the run, with which the table's name begins.
         detector: Detector of tools and objects, as `python -m experiments.applications.detector` writes it.
     """
-    finder, rows, table = Detector.load(detector), [], out / f"{name}_hidden.csv"
-    simulator = load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
-    robots = native_robots(simulator.robots)
-    pin_name(out, name, run, simulator, detector)
-    with step("objects that come back") as update:
-        for i, robot in enumerate(robots):
-            spec, rng = SPECS[robot], np.random.default_rng([0, i])
-            rollout = simulate(spec, episode_seeds(spec, EPISODES, 0, "val"))
-            n, steps = rollout.q.shape[:2]
-            flat = (x.reshape(-1, *x.shape[2:]) for x in (rollout.q, rollout.objects))
-            share = points_of(spec, np.repeat(rollout.seeds, steps), *flat).share.reshape(n, steps, -1)
-            events = find_events(share, rollout.lengths, len(spec.body.tools), rng)
-            if events:
-                # unused episodes repeat the first event
-                judged = (events * (2 * PER_ROBOT))[: 2 * PER_ROBOT]
-                rows += judge(simulator, finder, spec, rollout, judged)[: len(events)]
-            update(i + 1, len(robots), robot)
-    require(bool(rows), f"no object is hidden and comes back in held-out episodes of {', '.join(robots)}")
-    write_rows(table, rows)
-    for kind in ("hidden", "control"):
-        own = [row for row in rows if row["kind"] == kind]
-        names = ("gone", "lag", "found", "close", "true_found", "true_close")
-        means = {k: np.mean([float(r[k]) for r in own]) for k in names}
-        console.print(f"{kind}: {len(own)} events, " + ", ".join(f"{k} {v:.2f}" for k, v in means.items()))
-    wrote(table)
+    with Workspace(out).locked(f".{name}.lock"):
+        finder, rows, table = Detector.load(detector), [], out / f"{name}_hidden.csv"
+        simulator = load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
+        robots = native_robots(simulator.robots)
+        pin_name(out, name, run, simulator, detector)
+        with step("objects that come back") as update:
+            for i, robot in enumerate(robots):
+                spec, rng = SPECS[robot], np.random.default_rng([0, i])
+                rollout = simulate(spec, episode_seeds(spec, EPISODES, 0, "val"))
+                n, steps = rollout.q.shape[:2]
+                flat = (x.reshape(-1, *x.shape[2:]) for x in (rollout.q, rollout.objects))
+                share = points_of(spec, np.repeat(rollout.seeds, steps), *flat).share.reshape(n, steps, -1)
+                events = find_events(share, rollout.lengths, len(spec.body.tools), rng)
+                if events:
+                    # unused episodes repeat the first event
+                    judged = (events * (2 * PER_ROBOT))[: 2 * PER_ROBOT]
+                    rows += judge(simulator, finder, spec, rollout, judged)[: len(events)]
+                update(i + 1, len(robots), robot)
+        require(bool(rows), f"no object is hidden and comes back in held-out episodes of {', '.join(robots)}")
+        write_rows(table, rows)
+        for kind in ("hidden", "control"):
+            own = [row for row in rows if row["kind"] == kind]
+            names = ("gone", "lag", "found", "close", "true_found", "true_close")
+            means = {k: np.mean([float(r[k]) for r in own]) for k in names}
+            console.print(f"{kind}: {len(own)} events, " + ", ".join(f"{k} {v:.2f}" for k, v in means.items()))
+        wrote(table)
 
 
 def main() -> None:

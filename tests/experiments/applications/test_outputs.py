@@ -5,7 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from experiments.applications.detector import train_for_run
 from experiments.applications.endurance.__main__ import drive_run
+from experiments.applications.endurance.hidden import measure_hidden
+from experiments.applications.in_place import measure_run
 from experiments.applications.own_policy import compare_in_run as compare_policies
 from experiments.applications.plan_actions import plan_in_run
 from experiments.applications.synthetic import compare_in_run as compare_synthetic
@@ -22,7 +25,13 @@ HOLDING: dict[str, Callable[[Path], None]] = {
     "plan_actions": lambda out: plan_in_run(NOWHERE, out),
     "synthetic": lambda out: compare_synthetic(NOWHERE, out),
     "endurance": lambda out: drive_run(NOWHERE, out),
+    "hidden": lambda out: measure_hidden(NOWHERE, out),
+    "in_place": lambda out: measure_run(NOWHERE, out),
+    "detector": lambda out: train_for_run(NOWHERE, out),
 }
+BY_NAME = ("endurance", "hidden")
+"""Several of these may write into one directory, each under another --name."""
+
 WRITING = HOLDING | {"generate": lambda out: generate(NOWHERE, actions="nowhere", out=out, clips=0)}
 
 
@@ -38,6 +47,6 @@ def test_a_file_in_place_of_the_directory_is_said_before_a_model_is_loaded(comma
 @pytest.mark.parametrize("command", HOLDING)
 def test_a_second_command_is_refused_in_a_directory_in_use(command, tmp_path):
     """Both removed what the other was reading."""
-    lock = {"lock": ".model.lock"} if command == "endurance" else {}
+    lock = {"lock": ".model.lock"} if command in BY_NAME else {}
     with Workspace(tmp_path).locked(**lock), pytest.raises(Held, match="another command is using"):
         HOLDING[command](tmp_path)
