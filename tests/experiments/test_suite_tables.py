@@ -15,7 +15,6 @@ from experiments.analysis.explained_share import EXPLAINED, read_shares
 from experiments.suite import explained as explained_module
 from experiments.suite import siblings as siblings_module
 from experiments.suite import tokenizer as tokenizer_module
-from experiments.suite.clips import animation, clip
 from experiments.suite.explained import explained
 from experiments.suite.siblings import OUT, Samples, gain, judge, predictor, sample
 from experiments.suite.tokenizer import quality
@@ -145,13 +144,6 @@ def test_the_simulator_still_gives_the_committed_sibling_figures():
     for name in ("over_strangers", "over_shuffled"):
         then = [float(row[column]) for column in (name, f"{name}_low", f"{name}_high")]
         assert getattr(result, name) == pytest.approx(then, abs=2e-2)
-
-
-def test_a_clip_plays():
-    spec = BY_NAME["rover_sky"]
-    frames = clip(spec, seconds=1.0)
-    assert frames.shape == (10, 64, 64, 3) and (frames[0] != frames[-1]).any()
-    assert animation(frames, spec.hz).startswith('<img alt="" src="data:image/webp;base64,')
 
 
 def test_pixels_that_change_are_judged_by_themselves():
