@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from PIL import Image
 
 from data_pipelines.simulators import generate
+from experiments.cli.data.contact_sheet import TILE
 from experiments.cli.main import main
 from tests.data_pipelines.simulators.fakes import fake_workers
 
@@ -24,7 +26,8 @@ def test_datasets_and_contact_sheets_are_written_and_named(tmp_path, monkeypatch
     said = capsys.readouterr().out
     assert "2 of 2 episodes" in said
     assert f"next: hma study --preset smoke --out runs/sim --data {tmp_path}/*/1.0.0" in said
-    assert (tmp_path / "overview.png").stat().st_size > 0
+    assert f"or, to look at them first: hma data view {tmp_path}/*/1.0.0" in said
+    assert Image.open(tmp_path / "pusht" / "contact.png").height > 2 * TILE  # a row for each episode
     found = sorted(p.name for p in (tmp_path / "pusht").iterdir())
     assert found == ["1.0.0", "contact.png", "stats.json"]
 

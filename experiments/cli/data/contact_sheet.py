@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Collection, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from hma_jax.runtime.files import write_file
+
 if TYPE_CHECKING:
-    from data_pipelines.inspection.inspect import ExampleEpisode
+    from data_pipelines.inspection.inspect import ExampleEpisode, Sample
 
 TILE = 112
 """Height of a frame in pixels."""
@@ -17,6 +21,15 @@ TILE = 112
 GAP = 4
 MARGIN = 12
 INK, FAINT, ACCENT, PAPER = (32, 33, 36), (130, 134, 139), (26, 95, 180), (255, 255, 255)
+
+
+def write_sheet(path: Path, sample: Sample) -> None:
+    """A PNG of the example episodes of a dataset."""
+    facts = sample.facts
+    title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
+    drawn = io.BytesIO()
+    draw_sheet(title, sample.examples, [c.key for c in facts.cameras if c.is_blank]).save(drawn, format="png")
+    write_file(path, drawn.getvalue())
 
 
 def draw_sheet(title: str, examples: Sequence[ExampleEpisode], blank: Collection[str] = ()) -> Image.Image:

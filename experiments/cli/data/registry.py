@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,7 +28,7 @@ from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
-    from data_pipelines.inspection.inspect import Facts, Sample
+    from data_pipelines.inspection.inspect import Facts
     from data_pipelines.inspection.suggest import Suggestion, WindowFacts
 
 SHEET = "contact_sheet.png"
@@ -142,6 +141,7 @@ def data_inspect(
     from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.inspection.suggest import NO_CAMERA, require_own_rate, suggest_entry
     from data_pipelines.sources.rlds.location import locate
+    from experiments.cli.data.contact_sheet import write_sheet
     from experiments.preparing.sources import say_other_versions
 
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
@@ -172,7 +172,10 @@ def data_inspect(
     rate = hz or (taken.hz if taken else suggested)
     windows = _report_windows(facts, rate, hz, taken, frames) if rate else None
     _print_entry(known, suggestion)
-    _draw_contact_sheet(sample, out or sheets / facts.name)
+    sheet = (out or sheets / facts.name) / SHEET
+    sheet.parent.mkdir(exist_ok=True)
+    write_sheet(sheet, sample)
+    wrote(sheet)
     if json is not None:
         values = dataclasses.asdict(facts) | {"suggestion": suggestion and dataclasses.asdict(suggestion)}
         write_file(json, to_strict_json(values))
@@ -205,20 +208,6 @@ def _report_windows(facts: Facts, rate: float, hz: float | None, taken: DatasetS
         f"shortest; about {windows.total:,.0f} windows in the split"
     )
     return windows
-
-
-def _draw_contact_sheet(sample: Sample, folder: Path) -> None:
-    """Writes FOLDER/contact_sheet.png."""
-    from experiments.cli.data.contact_sheet import draw_sheet
-
-    facts = sample.facts
-    folder.mkdir(exist_ok=True)
-    blank = [c.key for c in facts.cameras if c.is_blank]
-    title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
-    drawn = io.BytesIO()
-    draw_sheet(title, sample.examples, blank).save(drawn, format="png")
-    write_file(folder / SHEET, drawn.getvalue())
-    wrote(folder / SHEET)
 
 
 def print_facts(facts: Facts) -> None:

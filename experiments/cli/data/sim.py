@@ -42,8 +42,7 @@ PRESETS = {
     "full": Amount(None, episodes=20, size=128, study="cpu"),
 }  # fmt: skip
 
-SHEET = "overview.png"
-SHEET_EPISODES = 4
+SHEET, SHEET_EPISODES = "contact.png", 4
 
 REPORT = 10
 """Number of episodes between two lines of a log."""
@@ -64,7 +63,7 @@ def data_sim(
     is made, and the bytes are the same. Existing datasets with another number of episodes, size or seed are refused.
 
     Args:
-        out: Directory to write: one dataset per embodiment, and contact sheets.
+        out: Directory to write: one dataset per embodiment, each with a contact sheet.
         preset: smoke (12 embodiments, 4 episodes, 64 pixels: minutes) or full (all embodiments, 20
             episodes, 128 pixels: hours).
         names: Only these embodiments. Default: the preset's.
@@ -73,9 +72,10 @@ def data_sim(
         workers: Simulators that run at the same time, each in a process with one core; no effect on the data.
         seed: Random seed; another one gives other episodes.
     """
+    from data_pipelines.inspection.inspect import inspect_dataset
     from data_pipelines.simulators import generate_sim, select
-    from data_pipelines.simulators.sheet import draw_sheet
     from data_pipelines.sources.rlds.writer import VERSION
+    from experiments.cli.data.contact_sheet import write_sheet
 
     chosen = PRESETS[preset]
     specs = select(tuple(names) or chosen.names)
@@ -94,12 +94,13 @@ def data_sim(
     paths = [out / spec.name / VERSION for spec in specs]
     with step("draw contact sheets"):
         for path in paths:
-            draw_sheet([path], path.parent / "contact.png", SHEET_EPISODES)
-        draw_sheet(paths, out / SHEET)
+            sample = inspect_dataset(str(path), episodes=SHEET_EPISODES, max_examples=SHEET_EPISODES)
+            write_sheet(path.parent / SHEET, sample)
     everything = sorted(paths) == sorted(out.glob(f"*/{paths[0].name}"))  # then a pattern is shorter
     data = f"{command_words(out)}/*/{paths[0].name}" if everything else command_words(*paths)
     study = command("study", "--preset", chosen.study, "--out", "runs/sim")
-    wrote(*paths, out / SHEET, then=f"{study} --data {data}")
+    wrote(*paths, then=f"{study} --data {data}")
+    say(f"or, to look at them first: {command('data view')} {data}")
 
 
 def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, seed: int) -> list[str]:
