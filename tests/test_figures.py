@@ -21,7 +21,7 @@ from experiments.applications import DRIVEN
 from experiments.applications.plan_actions import Settings, read_trials
 from experiments.applications.policies.tasks import Task
 from experiments.presets import PRESETS
-from hma_jax.config import EvalConfig
+from hma_jax.config import EvalConfig, TrainConfig
 from hma_jax.evaluation.effects import MIN_EPISODES
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import WindowTable
@@ -143,6 +143,31 @@ def test_how_many_episodes_are_held_out_is_as_the_page_on_own_data_says():
         "Of fewer than 70 episodes (fewer than 350 with `paper`, which holds out 1 % instead of 5 %) at most 3" in page
     )
     assert f"of fewer than 8 a single one: too few for `hma check`, which needs {MIN_EPISODES}." in page
+
+
+def test_presets_differ_from_the_release_in_training_as_the_page_on_own_data_says():
+    def differing(name: str) -> set[str]:
+        train, released = PRESETS[name].train, TrainConfig()
+        return {
+            f"{group}{key}"
+            for group, ours, theirs in (("", train, released), ("optimizer.", train.optimizer, released.optimizer))
+            for key, value in vars(ours).items()
+            if key != "optimizer" and value != vars(theirs)[key]
+        }
+
+    page = " ".join((ROOT / "docs" / "own_data.md").read_text().split())
+    said = (
+        "Its learning rate is five times the release's and falls over the last fifth of the steps, of which there are "
+        "20,000 instead of 60,000; AdamW's ε is smaller, as in `paper`, which otherwise trains as the release does."
+    )
+    assert said in page
+    rate = {"optimizer.learning_rate", "optimizer.schedule"}
+    assert differing("accelerator") == {"steps", "optimizer.epsilon"} | rate
+    assert differing("paper") == {"optimizer.epsilon"}
+    ours, released = PRESETS["accelerator"].train, TrainConfig()
+    assert ours.optimizer.learning_rate == pytest.approx(5 * released.optimizer.learning_rate)
+    assert (ours.optimizer.schedule, ours.optimizer.decay_fraction) == ("wsd", 0.2)
+    assert (ours.steps, released.steps) == (20_000, 60_000)
 
 
 JUDGED = {
