@@ -187,7 +187,8 @@ class DatasetSpec:
             raise ConfigError(
                 f"{name}: the model was trained with frames at stride {robot.stride}, but here the stride is {stride} "
                 f"at {self.hz:g} Hz. Write `rate = {right}` into the entry of {name}, {again}; --set rate={right} "
-                "does the same for all datasets whose entries have no rate."
+                "does the same for all datasets whose entries have no rate. To train at stride "
+                f"{stride}, add it as a new robot with `hma adapt --everything` (docs/models.md, Another rate)."
             )
         self.check_layout(robot, f", {again}")
 

@@ -1,6 +1,7 @@
 """`hma train`: its own settings, and what it says it trains on."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 
 from data_pipelines.loading import loader
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry import table as registry_table
+from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.evalset import freeze_manifest
 from experiments.cli.initial_model import new_datasets, setup_of
 from experiments.cli.main import main
@@ -35,6 +38,8 @@ from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.windows.test_evalset import small_store
 from tests.experiments.idle import ARM, BASE, SMOKE, idle_training  # noqa: F401
 from tests.hma_jax.convert.fakes import DISCRETE, make_checkpoint
+
+PAGE = Path(__file__).parents[2] / "docs" / "models.md"
 
 
 @pytest.fixture(scope="module")
@@ -396,6 +401,29 @@ def test_robots_are_added_to_the_averaged_weights_of_a_run_that_keeps_them(tmp_p
     after = load_run(adapted)
     assert (after.step, after.provenance, after.train.only) == (2, before.provenance, (BASE.name,))
     assert after.table == before.table
+
+
+def test_a_known_robot_is_trained_at_its_native_rate_as_the_page_says(tmp_path, monkeypatch, capsys):
+    """As in the paper's post-training, after pre-training at 2 Hz. Actions between frames are fewer then."""
+    monkeypatch.setattr(registry_table, "_registered", {})
+    data, source, native = write_rlds(tmp_path, ARM, [18] * 12), tmp_path / "a" / "model", tmp_path / "b" / "model"
+    assert main(["train", *SMOKE, "--out", str(tmp_path / "a"), "--data", str(data)]) == 0
+    given = ["--out", str(tmp_path / "b"), "--data", str(data), "--tokenizer", str(tmp_path / "a" / "tokenizer")]
+    capsys.readouterr()
+    assert main(["train", "--from", str(source), *SMOKE, *given, "--set", "rate=null"]) == 2
+    assert "add it as a new robot with `hma adapt --everything`" in " ".join(capsys.readouterr().err.split())
+
+    (entry,) = re.findall(r"```toml\n(\[cory_hall_native\]\n.*?)```", PAGE.read_text(), re.DOTALL)
+    (tmp_path / "native.toml").write_text(entry)
+    given += ["--registry", str(tmp_path / "native.toml")]
+    assert main(["adapt", str(source), *SMOKE, *given, "--everything"]) == 0
+    assert "new: cory_hall_native; training everything" in capsys.readouterr().out
+    known, new = load_run(native).table.entries
+    assert (known, (new.name, new.stride)) == (load_run(source).table.entries[0], ("cory_hall_native", 1))
+    held_out = [
+        TokenStore(tmp_path / at / "tokens").manifest(name).val for at, name in (("a", ARM.name), ("b", new.name))
+    ]
+    assert held_out[0].episodes == held_out[1].episodes
 
 
 def make_released(root: Path, *robots: tuple[str, int, int]) -> Path:

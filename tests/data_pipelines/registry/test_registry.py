@@ -370,6 +370,9 @@ def test_the_rate_that_is_advised_gives_the_stride_of_the_model(hz, stride):
     with pytest.raises(ConfigError, match=f"trained with frames at stride {stride}, but here the stride is") as refused:
         spec.check_compatible(robot, rate=2.0)
     rate = re.search(r"`rate = ([0-9.]+)` into the entry of toy", str(refused.value))[1]
+    assert f"To train at stride {spec.stride}, add it as a new robot with `hma adapt --everything`" in str(
+        refused.value
+    )
     replace(spec, rate=float(rate)).check_compatible(robot, rate=2.0)
     with pytest.raises(ConfigError, match=r"trained with 2 action values, .* has 3: action \(3\)"):
         spec.check_compatible(Embodiment("toy", 2, stride, (0.0,) * 2, (1.0,) * 2), rate=2.0)
