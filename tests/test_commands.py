@@ -6,6 +6,7 @@ write several at once (`hma bench generate|train`) and end in `...`.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import functools
 import importlib.util
@@ -15,7 +16,7 @@ import shlex
 import shutil
 import subprocess
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,14 @@ QUICK = (
     "python -m experiments.sweeps.width --preset cpu --dry-run",
 )
 """Of the documented commands, those that take a moment and need no data; tests run them."""
+
+IN_OUT = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+"""The arguments that decide what a command makes in --out."""
+IN_OUT.add_argument("--out")
+IN_OUT.add_argument("--preset", default="cpu")
+for name in ("--data", "--mixture", "--tokenizer"):
+    IN_OUT.add_argument(name, nargs="*", default=())
+IN_OUT.add_argument("--set", action="append", default=[])
 
 
 def blocks(page: str) -> Iterator[str]:
@@ -261,6 +270,40 @@ def test_blocks_are_read_as_a_shell_does():
         "hma tokenize --preset cpu", "hma train --preset cpu", "hma bench train --model base      --batch 8",
         "python -m pytest x",
     ]  # fmt: skip
+
+
+def contents(command: str) -> tuple[str, Hashable] | None:
+    """(--out, what its contents are made from) of a command that is refused where --out holds something else: a shipped
+    model, or the tokenizer, tokens and windows of a study."""
+    match shlex.split(command):
+        case ["python", "-m", "experiments.applications.ship", run, *words]:
+            return IN_OUT.parse_known_args(words)[0].out, run
+        case ["hma", "tokenize" | "train" | "adapt" | "evaluate" | "study" | "sweep", *words]:
+            given = IN_OUT.parse_known_args(words)[0]
+            settings = {word for word in given.set if word.startswith(("tokenizer.", "store.", "suite.", "rate="))}
+            return given.out, (given.preset, *map(frozenset, (given.data, given.mixture, given.tokenizer, settings)))
+    return None
+
+
+def contradictions(page: str) -> list[str]:
+    """Commands in the blocks of a page that are refused after those before them, since --out holds something else."""
+    held: dict[str | None, Hashable] = {}
+    found = [(command, made) for command in blocks(page) if (made := contents(command)) and made[0]]
+    return [command for command, (out, inputs) in found if held.setdefault(out, inputs) != inputs]
+
+
+def test_commands_of_a_page_can_be_given_one_after_the_other():
+    wrong = [f"{page.name}: {command}" for page in PAGES for command in contradictions(page.read_text())]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_another_content_of_one_directory_is_found():
+    page = "```sh\nhma tokenize --out runs/a --data x y\nhma train --data y x --out runs/a --run m\n{}\n```\n"
+    for more in ("--data x", "--data x y --preset paper", "--data x y --tokenizer t", "--data x y --set rate=5"):
+        assert contradictions(page.format(f"hma train --out runs/a {more}")), more
+    ships = "python -m experiments.applications.ship {} --out runs/s --temperature 0\n"
+    assert contradictions(page.format(ships.format("runs/m") + ships.format("runs/n")))
+    assert not contradictions(page.format(ships.format("runs/m") * 2 + "hma train --out runs/b --data x"))
 
 
 @pytest.mark.parametrize("command", QUICK)
