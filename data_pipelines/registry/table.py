@@ -8,8 +8,6 @@ from collections.abc import Iterable
 
 from data_pipelines.registry.beyond_openx import BEYOND_OPENX
 from data_pipelines.registry.openx import OPENX
-from data_pipelines.registry.openx_more import OPENX_MORE
-from data_pipelines.registry.openx_rest import OPENX_REST
 from data_pipelines.registry.own import OWN
 from data_pipelines.registry.spec import DatasetSpec
 from hma_jax.config import ConfigError, require
@@ -96,7 +94,7 @@ def _table() -> dict[str, DatasetSpec]:
 def _groups() -> dict[str, tuple[DatasetSpec, ...]]:
     return {
         "own and samples": OWN,
-        "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE + OPENX_REST,
+        "Open-X (Open X-Embodiment)": OPENX,
         "other datasets of the paper": BEYOND_OPENX,
         "embedded suite (simulated)": _suite(),
         "simulator suite (extra sim)": _simulators(),

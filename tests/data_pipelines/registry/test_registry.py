@@ -16,14 +16,11 @@ from data_pipelines.registry import (
     get_mixture,
     get_spec,
     known_groups,
-    openx_rest,
+    openx,
     register,
 )
 from data_pipelines.registry import table as registry_table
-from data_pipelines.registry.openx import OPENX
-from data_pipelines.registry.openx_counts import EPISODES, LONG
-from data_pipelines.registry.openx_more import OPENX_MORE
-from data_pipelines.registry.openx_rest import OPENX_REST
+from data_pipelines.registry.openx import EPISODES, LONG, OPENX
 from data_pipelines.registry.spec import split_camera_key
 from data_pipelines.registry.toml_file import load_entries, put_entry, to_toml
 from data_pipelines.sources.rlds.dataset import RldsDataset
@@ -120,7 +117,7 @@ def test_termination_flags_and_future_actions_are_no_part_of_the_action():
 
 def test_open_x_entries_say_how_many_episodes_there_are():
     """But bridge_data_v2, which tfds gives no count of."""
-    unknown = {s.name for s in (*OPENX, *OPENX_MORE, *OPENX_REST) if not s.episodes}
+    unknown = {s.name for s in OPENX if not s.episodes}
     assert unknown == {"bridge_data_v2"}
     assert set(EPISODES) <= {s.name for s in all_specs()}
     language_table = get_spec("language_table")
@@ -137,7 +134,7 @@ def test_every_importable_dataset_of_the_catalogue_has_an_entry_or_a_reason():
     left_out = {"tidybot", "vima_converted_externally_to_rlds", "robo_ai_u_r5e"}
     assert published - {s.name for s in all_specs()} == left_out
     for name in left_out:
-        assert name.removesuffix(LONG) in inspect.getdoc(openx_rest)
+        assert name.removesuffix(LONG) in inspect.getdoc(openx)
 
 
 def test_what_an_entry_says_to_people_does_not_change_the_data():
