@@ -82,6 +82,15 @@ def test_starts_that_worlds_share_make_no_correlation_of_policies_that_are_alike
     assert means.min() > 0.4 and sum(lows < 0) >= 7
 
 
+def test_other_policies_could_agree_less_however_many_starts_there_are():
+    """What 400 starts say of 8 policies is sure; what they say of policies of their kind is not."""
+    rng, true = np.random.default_rng(0), np.linspace(0.1, 0.9, 8)
+    learned = np.clip(true + rng.normal(0, 0.2, 8), 0, 1)
+    found = agree(*(rng.random((8, 400)) < rates[:, None] for rates in (true, learned)), draws=200)
+    over_policies, over_starts = found.measures["pearson"], found.over_starts["pearson"]
+    assert over_policies.high - over_policies.low > 2 * (over_starts.high - over_starts.low)
+
+
 def test_too_few_starts_have_no_interval_over_starts_but_of_the_bias():
     rng = np.random.default_rng(0)
     for starts, known in ((LEAST_STARTS - 1, False), (LEAST_STARTS, True)):

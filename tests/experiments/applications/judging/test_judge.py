@@ -18,6 +18,7 @@ from experiments.applications.judging.judge import judge_run
 from experiments.applications.judging.ladder import LadderConfig, names
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, Outcome, read_outcomes, write_outcomes
 from experiments.applications.judging.page import write_page
+from experiments.applications.judging.rollouts import run
 from experiments.applications.judging.scatter import draw_scatter
 from experiments.applications.judging.summary import COLUMNS, summarise
 from experiments.applications.policies import find_task
@@ -70,6 +71,28 @@ def test_every_policy_is_judged_at_every_start_in_every_world(judged):
     assert not np.array_equal(a.images[:, 1:], b.images[:, 1:])
     control = found.rollouts("random", "shuffled")
     np.testing.assert_array_equal(control.actions[[1, 0]], found.rollouts("random", TRUE).actions[:2])
+
+
+def test_every_start_has_its_own_seed_in_whichever_batch_it_is():
+    """Else policies and the model drew the same in every batch."""
+    asked, black = [], np.zeros((2, 8, 8, 3), np.uint8)
+
+    class Black:
+        rate = "model"
+
+        def __len__(self):
+            return 2
+
+        def reset(self, starts, seeds):
+            asked.append((starts, seeds))
+            return black
+
+        def step(self, actions):
+            return black
+
+    policy = SimpleNamespace(reset=lambda seeds: asked.append(seeds), act=lambda images: np.zeros((2, 4)))
+    run(Black(), policy, ["a", "b", "c", "d"], [1, 2, 3, 4], ASKED.task)
+    assert asked == [[1, 2], (["a", "b"], [1, 2]), [3, 4], (["c", "d"], [3, 4])]
 
 
 @pytest.mark.parametrize(("name", "least"), [("demonstrations", 1), ("head_episodes", 3), ("batch", 2)])

@@ -10,11 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from data_pipelines.suite.rollout import episode_seeds
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot
 from data_pipelines.suite.tasks import Reach
 from data_pipelines.suite.world import World
 from experiments.applications.judging.rollouts import run
-from experiments.applications.policies import RandomPolicy, diffusion, find_task, load_policy, record, save_policy
+from experiments.applications.policies import (
+    RandomPolicy,
+    demonstrations,
+    diffusion,
+    find_task,
+    load_policy,
+    record,
+    save_policy,
+)
 from experiments.applications.policies.acting import Scale, make_examples, scale_of
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc, train_bc
 from experiments.applications.policies.closed_loop import goal_distance, run_policy, start_seeds
@@ -43,9 +52,11 @@ def demos():
     return record(TASK, 24, noise=(0.0, 0.4), image_size=8, after=1, seed=3)
 
 
-def test_demonstrations_are_what_the_simulator_does_under_their_actions():
-    demos = record(TASK, 3, noise=0.2, seed=1)
-    simulator = SuiteSimulator([ROBOT], episodes=3)
+@pytest.mark.parametrize("stride", [1, 2])
+def test_demonstrations_are_what_the_simulator_does_under_their_actions(stride):
+    """Each is held for as many native steps as a frame has."""
+    demos = record(TASK, 3, stride=stride, noise=0.2, seed=1)
+    simulator = SuiteSimulator([replace(ROBOT, stride=stride)], episodes=3)
     nothing = np.zeros((0, 4), np.float32)
     starts = [Start("gripper_wood", demos.images[i, :1], nothing, int(demos.seeds[i])) for i in range(3)]
     seen = [simulator.reset(starts)]
@@ -70,9 +81,24 @@ def test_only_successes_are_recorded_where_that_is_asked(demos):
     assert len(found) == 10 == len(set(found.seeds.tolist())) and found.successes.all()
 
 
-def test_as_many_are_recorded_as_were_asked_for_where_noises_share_them_unevenly():
+def test_as_many_are_recorded_as_were_asked_for_where_noises_share_them_unevenly(monkeypatch):
+    shares, drive = [], demonstrations.drive
+
+    def watched(task, seeds, *given, noise, play):
+        shares.append((noise, len(seeds)))
+        return drive(task, seeds, *given, noise=noise, play=play)
+
+    monkeypatch.setattr(demonstrations, "drive", watched)
     found = record(TASK, 3, noise=(0.0, 0.4), image_size=8, seed=3)
-    assert len(found) == 3 == len(set(found.seeds.tolist()))
+    assert len(found) == 3 == len(set(found.seeds.tolist())) and shares == [(0.0, 2), (0.4, 1)]
+
+
+def test_policies_are_tried_at_starts_that_are_in_no_demonstration():
+    """Nor in the dataset that a model was trained on."""
+    task = find_task("pusher_sand", "reach", frames=8)
+    recorded = [record(task, 20, image_size=8, seed=seed).seeds for seed in (0, 1)]
+    recorded += [episode_seeds(task.spec, 200, 0, split) for split in ("train", "val")]
+    assert not np.isin(start_seeds(task, 20), np.concatenate(recorded)).any()
 
 
 @pytest.mark.parametrize(
