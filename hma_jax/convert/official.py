@@ -85,6 +85,12 @@ def read_official(directory: Path) -> Run:
     )
     with _naming_file(where):
         model, masking = read_model(config, where), read_masking(config)
+        require(
+            model.concat or masking.predicts_frames,
+            f"jointly_predict_states is false, so that the model predicts actions alone, and with action_network "
+            f"{config.get('action_network', 'mlp')!r} from image tokens; here actions are predicted from action tokens only "
+            "(concat)",
+        )
     blocks = model.layers + (model.diffusion.depth if model.diffusion else 0)
     require(
         blocks <= len(tensors),  # before anything is built for each layer
@@ -120,7 +126,12 @@ def import_remarks(run: Run) -> list[str]:
     remarks = []
     if run.model.conditioning == "cross_attention":
         remarks.append("cross-attention is computed as the paper describes it; the release computes it differently")
-    if run.train.masking.predicts_actions:
+    if run.train.masking.predicts_actions and not run.model.concat:
+        remarks.append(
+            "the actions that it predicts are ignored: without concat in action_network the release reads them from image "
+            "tokens, here they are read from action tokens only; its frames are not affected"
+        )
+    elif run.train.masking.predicts_actions:
         remarks.append(
             "the actions that it predicts are wrong, here as in the release, which trains action heads on raw actions "
             "and un-normalises what they give (docs/reference.md, section 9.1); its frames are not affected. To "

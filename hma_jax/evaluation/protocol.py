@@ -86,8 +86,9 @@ class Predicted(NamedTuple):
 
 
 def predicts_actions(model: ModelConfig, setting: MaskingSetting) -> bool:
-    """Whether a model trained for `setting` has a policy to evaluate."""
-    return model.action_heads and setting in PREDICT_ACTIONS
+    """Whether a model trained for `setting` has a policy to evaluate. Without action tokens there is none, though
+    imported models may say so: the release then reads actions from image tokens (reference section 1.7)."""
+    return model.action_heads and model.concat and setting in PREDICT_ACTIONS
 
 
 def predicts_frames(setting: MaskingSetting) -> bool:

@@ -8,12 +8,13 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import ml_dtypes
 import numpy as np
 import pytest
 from safetensors import safe_open
 
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, EvalConfig
 from hma_jax.convert import (
     import_remarks,
     loads_in_release,
@@ -24,9 +25,10 @@ from hma_jax.convert import (
     write_official,
 )
 from hma_jax.convert.official import official_config as written_config
-from hma_jax.convert.official_config import read_masking
+from hma_jax.convert.official_config import NETWORKS, read_masking
 from hma_jax.convert.table import flat, official_parts
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
+from hma_jax.evaluation.protocol import make_predictor
 from hma_jax.model.hma import declare_model
 from hma_jax.training.runs import Run
 from tests.hma_jax.convert.fakes import (
@@ -124,6 +126,7 @@ def test_what_a_model_predicts_goes_there_and_back(setting, tmp_path):
         (DISCRETE, {}, None),
         (DISCRETE, {"action_network": "cross_attention"}, "cross-attention is computed as the paper"),
         (DISCRETE, {"jointly_predict_actions": True}, "actions that it predicts are wrong"),
+        (DISCRETE, {"jointly_predict_actions": True, "action_network": "mlp"}, "actions that it predicts are ignored"),
         (CONTINUOUS, {"use_mup": False}, None),
         (CONTINUOUS, {"use_mup": False, "jointly_predict_actions": True}, "actions that it predicts are wrong"),
         (CONTINUOUS, {}, "width is 16.* multiplied by 1 here"),
@@ -134,6 +137,23 @@ def test_what_a_model_predicts_goes_there_and_back(setting, tmp_path):
 def test_what_an_imported_model_may_compute_otherwise_is_said(base, changes, said, tmp_path):
     remarks = import_remarks(read_official(make_checkpoint(tmp_path / "a", base, ONE, **changes)))
     assert len(remarks) == (said is not None) and (said is None or re.search(said, remarks[0]))
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_an_imported_model_of_frames_and_actions_can_be_judged(network, tmp_path):
+    """Without action tokens its frames, as there is nothing to read actions from."""
+    run = read_official(
+        make_checkpoint(tmp_path / "a", DISCRETE, ONE, action_network=network, jointly_predict_actions=True)
+    )
+    config, frames = EvalConfig(prompt_frames=1), run.model.frames
+    predict = make_predictor(run.model, run.table, config, run.train.masking.setting)
+    batch = {
+        "tokens": np.zeros((2, frames, run.model.tokens), np.int32),
+        "actions": np.zeros((2, frames, run.table.action_width), np.float32),
+        **{name: np.zeros(2, np.int32) for name in ("embodiment", "episode", "start")},
+    }
+    metrics, predicted = jax.eval_shape(predict, run.params, batch)
+    assert ("action_error" in metrics) == ("concat" in network) and predicted.tokens.shape[1] == frames - 1
 
 
 def test_weights_that_were_changed_in_another_format_do_not_count_as_they_came(tmp_path):
@@ -265,6 +285,10 @@ def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
         ({"S": None}, "S must be a positive integer, got None"),
         ({"num_prompt_frames": 0}, "prompt_frames must be at least 1"),
         ({"jointly_predict_states": False}, "jointly_predict_states and jointly_predict_actions are both false"),
+        (
+            {"jointly_predict_states": False, "jointly_predict_actions": True, "action_network": "modulate"},
+            "predicts actions alone, and with action_network 'modulate' from image tokens",
+        ),
         ({"mlp_ratio": 1e308}, "a number that is too large"),
         ({"image_vocab_size": 10**400}, "a number that is too large"),
         ({"num_layers": 10**6}, "describes 1000000 layers, but there are only 57 tensors"),
