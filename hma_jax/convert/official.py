@@ -86,6 +86,11 @@ def read_official(directory: Path) -> Run:
     with _naming_file(where):
         model, masking = read_model(config, where), read_masking(config)
         require(
+            config.get("use_actions", True) is not False,
+            "use_actions is false: the release trains such a model without actions, which leaves its parameters for "
+            "actions untrained, so it cannot be imported",
+        )
+        require(
             model.concat or masking.predicts_frames,
             f"jointly_predict_states is false, so that the model predicts actions alone, and with action_network "
             f"{config.get('action_network', 'mlp')!r} from image tokens; here actions are predicted from action tokens only "

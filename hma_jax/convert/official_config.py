@@ -131,9 +131,12 @@ def _with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _complete(config: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """`_with_defaults`. Raises ConfigError for absent fields that have no default, and for invalid counts and lists."""
+    """`_with_defaults`. Raises ConfigError for absent fields without a usable default, and for invalid counts and
+    lists."""
     missing = [name for name in REQUIRED if config.get(name) is None]
-    require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
+    no_robots = set(missing) == {"action_domains", "d_actions"}
+    why = ": a model without robots, which the release trains without actions, cannot be imported" if no_robots else ""
+    require(not missing, f"{where}: missing field(s), or null: {', '.join(missing)}{why}")
     full = _with_defaults(config)
     for name in ("S", "d_model", *(["patch_size"] if is_continuous(config) else [])):
         require(_is_count(full[name]), f"{where}: {name} must be a positive integer, got {full[name]!r}")

@@ -281,6 +281,8 @@ def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
         ({"T": "three"}, "frames: expected int, got 'three'"),
         ({"d_actions": [3]}, "1 action_domains but|d_actions 3 of push is not a multiple of its 2"),
         ({"action_domains": None}, "missing field.*action_domains"),
+        ({"action_domains": None, "d_actions": None}, "null: action_domains, d_actions: a model without robots"),
+        ({"use_actions": False}, "use_actions is false: the release trains such a model without actions"),
         ({"d_actions": ["2"]}, "d_actions must list one value per robot"),
         ({"S": None}, "S must be a positive integer, got None"),
         ({"num_prompt_frames": 0}, "prompt_frames must be at least 1"),
