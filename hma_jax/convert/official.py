@@ -38,7 +38,7 @@ from hma_jax.convert.run_directory import require_run
 from hma_jax.convert.table import flat, from_official, nested, official_parts, to_official
 from hma_jax.convert.tensors import Stored, check_tensors, read_finite, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
-from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import DEAD_STD, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
 from hma_jax.training.runs import Run
@@ -141,6 +141,17 @@ def import_remarks(run: Run) -> list[str]:
             "the actions that it predicts are wrong, here as in the release, which trains action heads on raw actions "
             "and un-normalises what they give (docs/reference.md, section 9.1); its frames are not affected. To "
             "predict actions, train it further here (hma train --from): here targets are normalised"
+        )
+    constant = [
+        f"{e.name} ({', '.join(str(i) for i, std in enumerate(e.std) if 0 < std <= DEAD_STD)})"
+        for e in run.table.entries
+        if any(0 < std <= DEAD_STD for std in e.std)
+    ]
+    if constant:
+        remarks.append(
+            f"action values, counted from 0, whose stored deviation is at most {DEAD_STD:g} are 0 here: {', '.join(constant)}. "
+            "The release divides the rounding errors of such a constant by a deviation of their size, so its model was "
+            "trained with another number there, perhaps 1 or -1, and may make somewhat different frames here"
         )
     if run.model.diffusion and run.model.mup.enabled and run.model.width != BASE_WIDTH:
         remarks.append(

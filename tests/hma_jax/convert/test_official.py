@@ -139,6 +139,15 @@ def test_what_an_imported_model_may_compute_otherwise_is_said(base, changes, sai
     assert len(remarks) == (said is not None) and (said is None or re.search(said, remarks[0]))
 
 
+def test_constant_actions_that_the_release_shows_its_model_are_named(tmp_path):
+    """Of 0.3, in 1,000 rows, it stores the mean 0.30000007 and the deviation 6e-8: the model was shown -1."""
+    config = official_config(DISCRETE, TWO)
+    tensors = random_tensors(config, TWO)
+    tensors["action_preprocessor.1x_humanoid.std"][[0, 2, 5]] = 6e-8, 1e-7, 0
+    (remark,) = import_remarks(read_official(write_checkpoint(tmp_path / "a", config, tensors)))
+    assert "deviation is at most 1e-06 are 0 here: 1x_humanoid (0, 2). " in remark
+
+
 @pytest.mark.parametrize("network", NETWORKS)
 def test_an_imported_model_of_frames_and_actions_can_be_judged(network, tmp_path):
     """Without action tokens its frames, as there is nothing to read actions from."""
