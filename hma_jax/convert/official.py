@@ -52,6 +52,9 @@ WRAPPERS = ("module.", "_orig_mod.")
 ACTIONS_IN = ("stem/into/kernel", "action_head/robots/into/kernel")
 """Parameters [E, U, ...] that multiply actions, clean or noised."""
 
+TRAINABLE = (2, 512)
+"""Factors and entries of each that the release's loss assumes (reference section 1.8)."""
+
 CLIP = 10.0
 """The range +-CLIP in which the release keeps predicted clean values while sampling; its configuration has no field for
 it."""
@@ -279,6 +282,11 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
         remarks.append("the release's models have action heads, this model has none: they are written untrained")
     if not _unchanged_since_import(run):
         arrays |= _without_constant_actions(arrays, run.table)
+        if not form.diffusion and (form.factors, form.factor_vocab) != TRAINABLE:
+            remarks.append(
+                f"tokens have {form.factors} factors of {form.factor_vocab} entries: the release generates frames with this "
+                f"model, but cannot train it or compute its loss, which assumes {TRAINABLE[0]} factors of {TRAINABLE[1]}"
+            )
     remarks += _remarks(run.model, form)
     tensors = to_official(nested(arrays), official_parts(form, run.table, leaves))
     for entry in run.table.entries:

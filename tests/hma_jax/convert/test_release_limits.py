@@ -64,8 +64,9 @@ def everything(config, params, execution: ExecutionConfig) -> dict[str, np.ndarr
 
 
 def written(config, params, folder: Path, step: int = 7) -> tuple[Run, dict, list[str]]:
-    """What is read back, its config.json and the remarks."""
+    """What is read back, its config.json and the remarks, without that on the tiny vocabulary of all models here."""
     remarks = write_official(Run(config, train_config(), TABLE, params, step, {}), folder)
+    remarks = [remark for remark in remarks if "2 factors of 8 entries" not in remark]
     return read_official(folder), json.loads((folder / "config.json").read_text()), remarks
 
 
@@ -181,6 +182,13 @@ def test_the_release_is_given_the_scale_that_the_model_has_in_both_files():
     tensors, said = official_tensors(run)[0], official_config(run)["action_stats"]
     assert said == [[[-1.0, 4.0], [2.0, 4.0]]]
     assert said == [[tensors[f"action_preprocessor.push.{name}"].tolist() for name in ("mean", "std")]]
+
+
+@pytest.mark.parametrize(("vocab", "said"), [(256, True), (512, False)])
+def test_a_vocabulary_for_which_the_release_has_no_loss_is_said(vocab, said):
+    config = model_config(frames=3, action_heads=True, factors=2, factor_vocab=vocab)
+    _, remarks = official_tensors(Run(config, train_config(), TABLE, declare_model(config, TABLE).init(0), 7, {}))
+    assert any("2 factors of 256 entries: the release generates frames" in remark for remark in remarks) == said
 
 
 def test_another_range_of_clean_values_is_said(tmp_path):
