@@ -13,21 +13,23 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_pipelines.convert.episode import Conversion, encode
+import numpy as np
+
 from data_pipelines.errors import DataError, without_advice
 from data_pipelines.publishing.files import publish, sync
 from data_pipelines.publishing.fingerprint import FINGERPRINT, read_metadata, shard_lengths
 from data_pipelines.publishing.journal import Journal
 from data_pipelines.publishing.output_lock import lock_output
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.sources.convertible import ConvertibleSource, Skipped, UnitError
+from data_pipelines.sources.convertible import ConvertibleSource, Episode, Layout, Skipped, UnitError
+from data_pipelines.sources.rlds.example import encode_example
 from data_pipelines.sources.rlds.schema import RATE_KEY
 from data_pipelines.sources.rlds.tfrecord import write_shard
-from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
+from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, step_features, write_info
 from data_pipelines.sources.source import action_fields
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
@@ -42,6 +44,17 @@ JOURNAL = "journal.jsonl"
 
 Progress = Callable[[int, int, str], None]
 """Called with (units done, of how many, the unit just read)."""
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What a finished conversion wrote."""
+
+    directory: Path
+    spec: DatasetSpec  # the registry entry that reads it
+    episodes: int
+    shards: int
+    skipped: dict[str, int] = field(default_factory=dict)  # reason -> how many
 
 
 @dataclass(frozen=True)
@@ -150,6 +163,40 @@ def _write_shards(
         sync(partial / _part(len(shards) - 1))  # the journal's line below states that it exists
         journal.append(vars(shards[-1]))
     return shards
+
+
+def encode(episode: Episode, layout: Layout) -> bytes:
+    """The record of `episode`. Raises UnitError, naming the field, if it contradicts `layout`."""
+    steps = len(episode.instructions)
+    if not steps:
+        raise UnitError(f"{episode.origin}: the episode has no steps.")
+    rewards = np.zeros(steps, np.float32) if episode.rewards is None else np.asarray(episode.rewards)
+    if rewards.shape != (steps,):
+        raise UnitError(f"{episode.origin}: {rewards.shape} rewards for {steps} steps.")
+    features = step_features(rewards, episode.instructions)
+    features["episode_metadata/file_path"] = [episode.origin.encode()]
+    if layout.knows_success:
+        if episode.success is None:  # a record cannot say "unknown", and unknown must not be taken for failure
+            raise UnitError(f"{episode.origin}: it does not say whether it succeeded, but other recordings do.")
+        features["episode_metadata/success"] = np.array([episode.success], np.int64)
+    for key in layout.images:
+        frames = list(episode.images[key])
+        if len(frames) != steps:
+            raise UnitError(f"{episode.origin}: {len(frames)} frames in {key!r} for {steps} steps.")
+        features[f"steps/{key}"] = frames
+    for key, size in layout.vectors.items():
+        rows = np.asarray(episode.vectors[key])
+        if rows.shape != (steps, size):
+            raise UnitError(
+                f"{episode.origin}: {key!r} has the shape {list(rows.shape)}, but {steps} steps of {size} "
+                "values were expected."
+            )
+        finite = np.isfinite(rows).all(axis=1)
+        if not finite.all():
+            step = int(np.flatnonzero(~finite)[0])
+            raise UnitError(f"{episode.origin}: {key!r} is not finite at step {step}: {rows[step].tolist()}.")
+        features[f"steps/{key}"] = rows.astype(np.float32).ravel()
+    return encode_example(features)
 
 
 def _finish(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,14 +20,22 @@ from data_pipelines.sources.lerobot_meta import read_info
 from data_pipelines.sources.rlds import schema
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles, is_remote, locate
-from data_pipelines.sources.robomimic import read_environment
+from data_pipelines.sources.rlds.steps import known_mean_steps
+from data_pipelines.sources.robomimic import read_environment, read_totals
 from data_pipelines.sources.robomimic_dataset import RobomimicDataset, robomimic_name
-from data_pipelines.sources.size import SourceSize, lerobot_size, rlds_size, robomimic_size
 from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
 from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
+
+
+@dataclass(frozen=True)
+class SourceSize:
+    """The size of the splits that are read together."""
+
+    episodes: int  # damaged ones included
+    mean_steps: float = 0.0  # native frames of an episode; 0: not known
 
 
 class Format(NamedTuple):
@@ -39,16 +48,43 @@ class Format(NamedTuple):
     size: Callable[[Location, str], SourceSize | None]
 
 
+def _rlds_size(location: Location, split: str) -> SourceSize | None:
+    """None if one of the splits is missing, or all are empty. Raises DataError for damaged metadata."""
+    directory, parts = schema.resolve_version(location), split.split("+")
+    splits = schema.read_info(directory).splits
+    if not all(part in splits for part in parts):
+        return None
+    episodes = sum(sum(splits[part].shard_lengths) for part in parts)
+    return SourceSize(episodes, known_mean_steps(directory, split, episodes)) if episodes else None
+
+
+def _lerobot_size(root: Location, split: str) -> SourceSize | None:
+    """None if info.json does not state it. Raises DataError for a damaged info.json."""
+    info = read_info(root)
+    return _of_totals(info.get("total_episodes"), info.get("total_frames"))
+
+
+def _robomimic_size(path: Location, split: str) -> SourceSize | None:
+    """Raises DataError for a damaged file, ConfigError for an unknown split."""
+    return _of_totals(*read_totals(path, split))
+
+
+def _of_totals(episodes: object, steps: object) -> SourceSize | None:
+    if type(episodes) is not int or episodes < 1:
+        return None
+    return SourceSize(episodes, steps / episodes if type(steps) is int and steps > 0 else 0.0)
+
+
 FORMATS = {
     "rlds": Format(
-        RldsDataset, schema.dataset_name, lambda place: schema.read_rate(schema.resolve_version(place)), rlds_size
+        RldsDataset, schema.dataset_name, lambda place: schema.read_rate(schema.resolve_version(place)), _rlds_size
     ),
-    "lerobot": Format(LeRobotDataset, lerobot_name, lambda place: float(read_info(place)["fps"]), lerobot_size),
+    "lerobot": Format(LeRobotDataset, lerobot_name, lambda place: float(read_info(place)["fps"]), _lerobot_size),
     "robomimic": Format(
         RobomimicDataset,
         lambda place: robomimic_name(read_environment(place)[0]),
         lambda place: read_environment(place)[1],
-        robomimic_size,
+        _robomimic_size,
     ),
 }
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from data_pipelines.publishing.output_lock import backoff
-from experiments.running.attempts import read_states
-from experiments.running.ledger import Ledger
+from experiments.running.attempts import State, read_states
+from experiments.running.ledger import FINISHED, Ledger
+from experiments.running.trial import trial_id
 from experiments.running.workspace import Busy, Record, Workspace, load_record
 from experiments.sweeps.registry import AXES, KEPT, plan_sweeps
-from experiments.sweeps.sweep import Sweep, unique_trials
+from experiments.sweeps.sweep import CONTROL, POINT, Sweep, control_of, reference_trial, titles, unique_trials
 from experiments.terminal.progress import console, say, short, wrote
 from experiments.terminal.words import few
 from hma_jax.runtime.outputs import make_directory
@@ -44,7 +45,6 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.report.numbers import compute_numbers, find_fewer, find_other_x
     from experiments.report.page import write_report
     from experiments.report.sweeps import AxisStatistics
-    from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
 
     provenance = record.provenance
@@ -66,7 +66,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
         say(f"note: x of the axis episodes is what the datasets have, not what was trained on: {few(other)}")
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
-    others = write_tables(workspace, record, sweeps, states, numbers.results)
+    others = _write_tables(workspace, record, sweeps, states, numbers.results, available)
     tables = [workspace.results, workspace.robots, workspace.fits, *others]
     along = AxisStatistics(
         find_changes(sweeps, provenance, numbers.windows),
@@ -88,6 +88,45 @@ def _draw(workspace: Workspace, record: Record) -> None:
             path.unlink(missing_ok=True)  # figures of other trials, drawn before
     write_report(workspace, record, sweeps, rows, along, states, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
+
+
+def _write_tables(
+    workspace: Workspace,
+    record: Record,
+    sweeps: Sequence[Sweep],
+    states: Mapping[str, State],
+    results: Mapping[str, dict[str, Any]],
+    available: Mapping[str, int],
+) -> list[Path]:
+    """Writes trials.parquet and, if reference trials kept the numbers of their windows, controllability.csv on them and
+    their controls."""
+    from experiments.analysis.controllability import Controllability, controllability
+    from experiments.analysis.rows import write_csv
+    from experiments.analysis.tables import read_trials
+    from experiments.analysis.trials import trial_row, write_trials
+    from hma_jax.evaluation.windows import FILE
+
+    provenance = record.provenance
+    names, rows = titles(sweeps, provenance), []
+    for id, trial in unique_trials(sweeps, provenance).items():
+        state = states[id].event
+        result = results[id] if state == FINISHED else None
+        rows.append(trial_row(id, names[id], state, trial, provenance, result, available))
+    write_trials(workspace.trial_table, rows)
+    controllability_rows = []
+    references = [reference_trial(record.study, seed) for seed in record.study.seeds]
+    for role, trials in {POINT: references, CONTROL: [control_of(trial) for trial in references]}.items():
+        ids = [trial_id(trial, provenance) for trial in trials]
+        kept = [id for id in ids if (workspace.trials / id / FILE).exists()]
+        seeds = {judged.seed: judged.windows for judged in read_trials(workspace.trials, kept).values()}
+        controllability_rows += (
+            controllability(dict(sorted(seeds.items())), role, rate=record.study.rate) if seeds else []
+        )
+    if not controllability_rows:
+        workspace.controllability.unlink(missing_ok=True)  # from trials that are no longer the reference
+        return [workspace.trial_table]
+    write_csv(workspace.controllability, Controllability, controllability_rows)
+    return [workspace.trial_table, workspace.controllability]
 
 
 def draw_figures(

@@ -8,16 +8,20 @@ from __future__ import annotations
 import json
 import logging
 import os
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.summary import scalar
+
 from hma_jax.config import require
 from hma_jax.runtime.files import IO_ERRNOS, write_file
 from hma_jax.runtime.processes import is_writer
 from hma_jax.training.checkpoints import SaveError
-from hma_jax.training.tensorboard import TensorBoardWriter
 
 log = logging.getLogger(__name__)
 
@@ -190,6 +194,30 @@ class RunLog:
                 "permission to write, then run the same command again: it continues from the last checkpoint",
                 passing=error.errno in IO_ERRNOS,
             ) from error
+
+
+class TensorBoardWriter:
+    """An event file in `directory`; events of earlier files from `first_step` on are hidden.
+
+    The library's SummaryWriter passes events to a thread through a queue of ten. When the disk is full that thread
+    dies, and the run would wait for ever. This class raises OSError instead.
+    """
+
+    def __init__(self, directory: Path, first_step: int):
+        directory.mkdir(parents=True, exist_ok=True)
+        self._writer = EventsWriter(str(directory / "events"))
+        self._writer.write_event(Event(step=first_step, session_log=SessionLog(status=SessionLog.START)))
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            event = Event(wall_time=time.time(), step=step, summary=scalar(name, value))
+            self._writer.write_event(event)
+
+    def flush(self) -> None:
+        self._writer.flush()
+
+    def close(self) -> None:
+        self._writer.close()
 
 
 def _read_until(text: str, step: int) -> list[dict[str, Any]]:

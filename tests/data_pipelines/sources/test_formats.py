@@ -27,11 +27,10 @@ from data_pipelines.sampling.splits import HeldOut
 from data_pipelines.sources import lerobot_dataset, lerobot_meta
 from data_pipelines.sources.joined import JoinedSource
 from data_pipelines.sources.lerobot import LeRobotSource
-from data_pipelines.sources.open import FORMATS, find_format, open_source, read_rate, read_size, source_name
+from data_pipelines.sources.open import FORMATS, SourceSize, find_format, open_source, read_rate, read_size, source_name
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.robomimic import RobomimicSource
-from data_pipelines.sources.size import SourceSize
 from data_pipelines.sources.video import open_video
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError

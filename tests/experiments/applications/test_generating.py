@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.convert import write as convert_module
-from data_pipelines.convert.episode import encode
+from data_pipelines.convert.write import encode
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.lerobot_dataset import LeRobotDataset

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError, UnreachableError
-from data_pipelines.sources.open import read_size
+from data_pipelines.sources.open import SourceSize, read_size
 from data_pipelines.sources.rlds import dataset as dataset_module
 from data_pipelines.sources.rlds import index as index_module
 from data_pipelines.sources.rlds import location
@@ -19,7 +19,6 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.frame_spans import FrameSpanCache
 from data_pipelines.sources.rlds.index import index_path
 from data_pipelines.sources.rlds.tfrecord import scan_shard
-from data_pipelines.sources.size import SourceSize
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.data_pipelines.shards import index_shard
 
