@@ -58,25 +58,10 @@ def test_the_settings_differ_in_what_is_hidden_and_predicted():
     assert 0.4 < seen["full"][1] == seen["full"][2] < 0.6
 
 
-def test_a_policy_s_hidden_actions_are_all_from_one_frame_on():
-    _, masked = masked_batch(shallow_config(), MaskingConfig(setting="policy"))
-    hidden = np.asarray(masked.action_hidden_T)
-    assert (np.diff(hidden.astype(int), axis=1) >= 0).all() and hidden[:, -1].all()
-    assert len(np.unique(hidden.sum(1))) == 6
-
-
 def test_frame_zero_is_always_shown():
     for config in (shallow_config(), shallow_config(diffusion=DIFFUSION)):
         _, masked = masked_batch(config, MaskingConfig())
         assert not np.asarray(masked.masked)[:, 0].any() and np.asarray(masked.masked)[:, 1:].any()
-
-
-def test_how_many_actions_are_hidden_says_nothing_of_how_many_ids_are_corrupted():
-    """Each has random numbers of its own."""
-    masking = MaskingConfig(setting="full", non_mlm_ratio=0.0)
-    data, masked = masked_batch(shallow_config(), masking, batch=512)
-    corrupted = (np.asarray(masked.inputs) != data["tokens"]).mean((1, 2))
-    assert abs(np.corrcoef(corrupted, np.asarray(masked.action_hidden_T).mean(1))[0, 1]) < 0.15
 
 
 def test_an_example_s_masks_do_not_depend_on_its_batch():
@@ -112,14 +97,6 @@ def test_robots_without_actions_or_video_targets_train_what_they_can(setting: st
         assert np.asarray(masked.action_targets_T)[blind].any()
         counted = count_targets(masked, masked.inputs, MaskingConfig(setting=setting)).actions
         assert counted == np.asarray(masked.action_targets_T).sum() < np.asarray(masked.action_hidden_T).sum()
-
-
-def test_chunks_that_training_never_shows_are_hidden_at_inference():
-    robots = jnp.array([0, 1, 2, 1])
-    hidden = hidden_at_inference(MIXED, "forward", robots, 3)
-    assert hidden.tolist() == [[False] * 3, [True] * 3, [False] * 3, [True] * 3]
-    assert hidden_at_inference(TABLE, "forward", robots[:1], 3) is None
-    assert hidden_at_inference(TABLE, "passive", robots[:1], 3).tolist() == [[True] * 3]
 
 
 @pytest.mark.parametrize("diffusion, digest", [(None, 1553994923), (DIFFUSION, 988358124)])

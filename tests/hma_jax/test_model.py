@@ -92,6 +92,34 @@ def test_of_actions_attended_to_a_frame_s_own_weighs_as_much_as_all_earlier_ones
     np.testing.assert_allclose(again[:, 0], got[:, 5], atol=1e-5)
 
 
+def test_actions_are_attended_to_by_the_formula():
+    """By hand, in float64, for two robots: queries and keys are normalised, and their products scaled as muP says."""
+    config = shallow_config(conditioning="cross_attention", mup=MupConfig(attention_scale=3.0))
+    declared, rng, robots = declare(lambda: CrossAttention(config, 2)), np.random.default_rng(0), np.array([1, 0])
+    params = jax.tree.map(lambda x: rng.normal(size=x.shape).astype(np.float32), declared.shapes())
+    x, a = (rng.normal(size=(2, *shape, config.width)).astype(np.float32) for shape in ((4, 3), (4,)))
+    attend = jax.jit(lambda p: declared.merge(p)(x, ActionFeature(a, None), robots, causal_mask(4), None)[0])
+    got = attend(params)
+
+    def heads(y, name, robot):
+        y = (y.astype(np.float64) @ params[name][robot]).reshape(*y.shape[:-1], config.heads, -1)
+        if name == "v":
+            return y
+        y = (y - y.mean(-1, keepdims=True)) / np.sqrt(y.var(-1, keepdims=True) + 1e-6)
+        return y * params["gain"][robot] + params["bias"][robot]
+
+    for example, robot in enumerate(robots):
+        q, k, v = (heads(y[example], name, robot) for y, name in ((x, "q"), (a, "k"), (a, "v")))
+        for t in range(4):
+            logits = 3 / config.head_width * np.einsum("phi,shi->phs", q[t], k[: t + 1])
+            logits[..., t] += np.log(max(t, 1))  # as much as all earlier ones
+            weights = np.exp(logits - logits.max(-1, keepdims=True))
+            weights /= weights.sum(-1, keepdims=True)
+            y = np.einsum("phs,shi->phi", weights, v[: t + 1]).reshape(3, -1)
+            want = y @ params["out"]["kernel"][robot] + params["out"]["bias"][robot]
+            np.testing.assert_allclose(got[example, t], want, rtol=1e-3, atol=1e-3)
+
+
 def test_every_way_of_conditioning_in_blocks_is_a_class_of_its_own():
     """Not that of another one whose name it contains."""
     ways = {ModelConfig(conditioning=kind).block_conditioning for kind in get_args(Conditioning)}

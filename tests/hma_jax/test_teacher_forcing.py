@@ -106,6 +106,19 @@ def test_in_one_pass_over_masked_frames_only_what_is_shown_is_recalled():
     assert changed[:, 2].any()
 
 
+def test_nothing_that_is_hidden_of_a_partly_masked_token_is_recalled():
+    model, batch = make(diffusion=DIFFUSION, recall=True)
+    tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
+    cells = jnp.zeros((*tokens.shape[:3], DIFFUSION.cells), bool).at[:, 2, :, 0].set(True).at[:, 3:].set(True)
+    hidden = jnp.repeat(cells, DIFFUSION.channels, axis=-1)
+
+    @jax.jit
+    def said(tokens: jax.Array) -> jax.Array:
+        return model(tokens, cells, *rest).token_outputs
+
+    np.testing.assert_array_equal(said(jnp.where(hidden, tokens + 1, tokens)), said(tokens))
+
+
 @pytest.mark.parametrize("setting", ["full", "policy", "inverse"])
 def test_settings_that_predict_actions_are_refused(setting):
     with pytest.raises(ConfigError, match=f"teacher_forcing works only with settings .* '{setting}' predicts actions"):

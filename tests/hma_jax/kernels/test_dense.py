@@ -59,6 +59,13 @@ def test_each_example_is_multiplied_with_its_own_robot_s_matrix(product, sizes: 
     check_equal(lambda x, w: product(x, w, ROBOTS), lambda x, w: one_by_one(x, w, ROBOTS), x, w, tolerance=tolerance)
 
 
+@pytest.mark.parametrize("product", [per_robot, per_robot_from_actions, per_robot_to_actions])
+def test_a_robot_alone_has_the_gradient_of_all_its_examples(product):
+    """Summed, as that of each of several robots is."""
+    x, w, robots = drawn(0, 5, 3, 7), drawn(1, 1, 7, 9), jnp.zeros(5, int)
+    check_equal(lambda x, w: product(x, w, robots), lambda x, w: one_by_one(x, w, robots), x, w, tolerance=1e-5)
+
+
 WIDTHS = [1, 7, 31, 33, 65, 176, 300]
 
 
