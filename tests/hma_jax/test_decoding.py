@@ -93,6 +93,20 @@ def test_the_surest_tokens_are_drawn_first_or_any_by_the_order_that_is_asked_for
     assert ((other == 1).sum(1) == 1).all() and len(np.unique(other, axis=0)) > 1
 
 
+def test_the_order_is_drawn_apart_from_what_is_drawn(monkeypatch):
+    """Else the values of the tokens that are drawn first would be others than those of the rest."""
+    rows, size, given = 8, 16, []
+    monkeypatch.setattr(
+        decoding, "sample_tokens", lambda head, look, keys, *_: given.append(keys) or (look, jnp.zeros((rows, size)))
+    )
+    model, look = SimpleNamespace(config=model_config(tokens=size), frame_head=None), jnp.ones((rows, size), jnp.int32)
+    keys = jax.random.split(jax.random.key(0), rows)
+    first = np.asarray(decoding.decode_frame(model, look, lambda _: look + 1, keys, DecodeConfig(2))) == 1
+    scores = jax.vmap(lambda key: jax.random.uniform(key, (size,)))(given[0])
+    of_the_same_key = np.argsort(np.argsort(scores, axis=1), axis=1) >= size - 4
+    assert (first.sum(1) == 4).all() and (first != of_the_same_key).any(1).all()
+
+
 def test_latents_are_kept_within_the_clip_of_the_configuration():
     """Of a network that takes all that it sees for noiseless."""
     config = model_config(tokens=4, diffusion=replace(DIFFUSION, clip=0.1))

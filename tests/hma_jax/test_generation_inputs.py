@@ -15,7 +15,7 @@ from hma_jax.generation import (
     rollout,
     start,
 )
-from tests.tiny import TABLE, lively_params, model_config, shallow_config
+from tests.tiny import SMALLER, TABLE, lively_params, model_config, random_batch, shallow_config
 
 
 @pytest.mark.parametrize(
@@ -121,6 +121,25 @@ def test_a_session_goes_on_by_no_chunk_that_is_not_finite():
 
     with pytest.raises(ConfigError, match="the actions are not finite"):
         jax.eval_shape(go_on, params)
+
+
+def test_a_chunk_that_nothing_follows_is_held():
+    """With released alignment a frame is shown the chunk after it too, which a simulator does not know."""
+    config = model_config(**SMALLER)
+    declared, params = lively_params(config, scale=0.5)
+    batch, keys = random_batch(0, config, 4), jax.random.split(jax.random.key(0), 4)
+    chunk = batch["actions"][:, 0]
+
+    @jax.jit
+    def made(params, following):
+        model = declared.merge(params)
+        session = start(model, batch["tokens"][:, :1], batch["actions"][:, :0], batch["embodiment"])
+        decode = DecodeConfig(1, temperature=1.0)
+        return advance(model, session, chunk, keys, decode, next_chunk_BU=following, phase="filling")[1]
+
+    held = made(params, chunk)
+    np.testing.assert_array_equal(made(params, None), held)
+    assert (made(params, 0 * chunk) != held).any()
 
 
 @pytest.mark.parametrize(

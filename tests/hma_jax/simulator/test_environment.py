@@ -187,6 +187,17 @@ def test_the_vector_environment_begins_episodes_anew_when_they_end():
     assert env.unwrapped._task.simulator.counts == (3, 3)
 
 
+def test_a_step_in_which_an_episode_begins_anew_rewards_and_ends_nothing():
+    """The judge still sees where the last one ended: its reward would count twice, and the new episode end at once."""
+    judge = lambda simulator: (np.full(2, 2.5), np.array([True, False]))  # noqa: E731
+    env = RobotVectorEnv(2, simulator=Still(2), starts=STARTS, robot="arm", judge=judge)
+    env.reset(seed=0)
+    low = np.stack([env.single_action_space.low] * 2)
+    seen = [[x.tolist() for x in env.step(low)[1:3]] for _ in range(3)]
+    ended, began = [[2.5, 2.5], [True, False]], [[0.0, 2.5], [False, False]]
+    assert seen == [ended, began, ended]
+
+
 def test_each_of_a_vector_is_what_the_environment_alone_makes():
     """For the same starts, seeds and actions."""
     sim = simulator(episodes=2)

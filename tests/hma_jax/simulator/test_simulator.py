@@ -232,25 +232,6 @@ def test_the_frames_of_a_snapshot_cannot_be_written_to(tmp_path):
         np.testing.assert_array_equal(sim.images, before)
 
 
-def test_a_snapshot_from_a_file_is_gone_on_from_and_taken_back(tmp_path):
-    """By a simulator whose same episodes have begun anew."""
-    sim, other = simulator(episodes=2), simulator(episodes=2)
-    for one in (sim, other):
-        one.reset([start(0, 1), start(1, 2)], seeds=[3, 4])
-    plan = chunks_of(0, 9)
-    for chunk in plan[:6]:
-        sim.step([chunk, None])
-    np.savez(tmp_path / "kept.npz", **as_arrays(sim.snapshot()))
-    with np.load(tmp_path / "kept.npz") as file:
-        other.restore(from_arrays(file, other.snapshot()))
-    np.testing.assert_array_equal(other.images, sim.images)
-    assert other.counts == sim.counts == (7, 2)
-    for one in (sim, other):
-        one.rewind(2, [0])
-    for chunk in plan[4:]:
-        np.testing.assert_array_equal(other.step([chunk, None]), sim.step([chunk, None]))
-
-
 @pytest.mark.parametrize("back", [1, 4, 11])
 def test_what_was_taken_back_comes_again_under_the_same_actions(back: int):
     sim, plan = simulator(), chunks_of(0, 12)
@@ -379,6 +360,9 @@ def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
         ),
         (lambda sim: sim.rewind(1.5), r"frames must be whole numbers, got \[1.5\]"),
         (lambda sim: sim.branch([1.0, 1.0]), "sources must be whole numbers"),
+        (lambda sim: sim.branch([0]), r"branch needs 2 numbers of episodes to copy, each below 2, got \[0\]"),
+        (lambda sim: sim.branch([-1, 0]), r"each below 2, got \[-1, 0\]"),
+        (lambda sim: sim.branch([0, 2]), r"each below 2, got \[0, 2\]"),
         (lambda sim: simulator(episodes=1.5), r"episodes must be whole numbers, got \[1.5\]"),
         (lambda sim: simulator(decode={"unmask_steps": 2}), "decode must be a DecodeConfig, got dict"),
         (lambda sim: simulator(history=1.5), "history must be whole numbers"),
