@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, TokenizerConfig
+from hma_jax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.continuous import ContinuousTokenizer, make_continuous
 from hma_jax.tokenizers.lfq import LfqTokenizer
-from hma_jax.tokenizers.train import tokenizer_loss
+from hma_jax.tokenizers.train import make_optimizer, make_train_step, tokenizer_loss
+from hma_jax.training.state import TrainState
 from tests.hma_jax.pretrained import noise
 
 CONTINUOUS = TokenizerConfig(
@@ -81,16 +82,43 @@ def test_any_number_of_channels_makes_a_continuous_token():
             TokenizerConfig(quantise=False, **wrong)
 
 
+QUICK = replace(CONTINUOUS, encoder_blocks=0, decoder_blocks=0)
+"""Compiled in no time."""
+
+
 def test_noise_reaches_the_decoder_and_is_the_keys():
-    config = replace(CONTINUOUS, encoder_blocks=0, decoder_blocks=0)
-    declared = declare_tokenizer(config)
+    declared = declare_tokenizer(QUICK)
     params, images = declared.init(0), jnp.asarray(noise(4))
 
     def losses(noise: float) -> list[float]:
         """Of the same images under two keys."""
-        chosen = replace(config, latent_noise=noise)
+        chosen = replace(QUICK, latent_noise=noise)
         loss = jax.jit(lambda params, key: tokenizer_loss(declared, params, images, chosen, key)[0])
         return [float(loss(params, jax.random.key(seed))) for seed in (0, 1)]
 
     silent, noisy = losses(0.0), losses(0.3)
     assert silent[0] == silent[1] and len({*silent, *noisy}) == 3
+
+
+def test_every_step_of_training_draws_noise_of_its_own():
+    config, train = replace(QUICK, latent_noise=0.5), TokenizerTrainConfig()
+    declared = declare_tokenizer(config)
+    params, step = declared.init(0), jax.jit(make_train_step(config, train, declared))
+    optimizer = make_optimizer(train, declared).init(params)
+    losses = [float(step(TrainState(jnp.int32(n), params, optimizer), noise(4))[1]["loss"]) for n in (0, 0, 1)]
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_the_psnr_that_training_shows_is_that_of_images_from_0_to_255():
+    declared, images = declare_tokenizer(QUICK), noise(4)
+    params, config = declared.init(0), replace(QUICK, latent_noise=0.0)
+
+    @jax.jit
+    def shown_and_made(params):
+        model = declared.merge(params)
+        made = model.decoder(model.encoder(images / 127.5 - 1.0))
+        return tokenizer_loss(declared, params, jnp.asarray(images), config, jax.random.key(0))[1]["psnr"], made
+
+    shown, made = shown_and_made(params)
+    error = np.mean(((np.asarray(made, np.float64) + 1) * 127.5 - images) ** 2)
+    assert float(shown) == pytest.approx(10 * np.log10(255**2 / error), abs=1e-3)

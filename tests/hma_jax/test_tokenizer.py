@@ -16,7 +16,7 @@ import pytest
 from hma_jax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.frames import compose, factorise
-from hma_jax.model.params import Declared, ParamSpec, normal
+from hma_jax.model.params import Declared, ParamSpec, zeros
 from hma_jax.tokenizers import quantizer
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
 from hma_jax.tokenizers.base import PIECE, in_pieces
@@ -353,13 +353,37 @@ def test_other_images_are_not_trained_on(images, got, tmp_path):
         train_tokenizer(CONFIG, TRAIN, lambda start: itertools.repeat(images), tmp_path)
 
 
+TWO = Declared(None, {name: ParamSpec((3,), (None,), "hidden", name == "w", zeros) for name in ("w", "b")}, 1)
+"""A matrix, and a bias, which does not decay."""
+
+
+def updates_of(gradients: list[float], **settings) -> dict[str, np.ndarray]:
+    """[n, 3] each: what the optimiser adds to TWO, all ones, in every step."""
+    params = {"w": jnp.ones(3), "b": jnp.ones(3)}
+    optimizer = make_optimizer(replace(TRAIN, **settings), TWO)
+    state, update, found = optimizer.init(params), jax.jit(optimizer.update), []
+    for gradient in gradients:
+        moved, state = update({name: jnp.full(3, gradient) for name in params}, state, params)
+        found.append(moved)
+    return {name: np.array([moved[name] for moved in found]) for name in params}
+
+
 @pytest.mark.parametrize("steps", [1, 2, 3])
 def test_runs_shorter_than_their_warm_up_learn(steps):
-    one_array = Declared(None, {"w": ParamSpec((3,), (None,), "hidden", True, normal(1.0))}, 1)
-    optimizer = make_optimizer(replace(TRAIN, steps=steps, warmup_steps=50), one_array)
-    params = {"w": jnp.ones(3)}
-    state, sizes = optimizer.init(params), []
-    for _ in range(steps):
-        updates, state = jax.jit(optimizer.update)(params, state, params)
-        sizes.append(float(jnp.abs(updates["w"]).max()))
-    assert np.isfinite(sizes).all() and max(sizes) == pytest.approx(TRAIN.learning_rate, rel=0.01)
+    sizes = np.abs(updates_of([1.0] * steps, steps=steps, warmup_steps=50)["w"])
+    assert np.isfinite(sizes).all() and sizes.max() == pytest.approx(TRAIN.learning_rate, rel=0.01)
+
+
+def test_the_rate_warms_up_and_falls_to_its_end_and_biases_do_not_decay():
+    """Without gradients decay alone moves anything."""
+    settings = dict(steps=10, warmup_steps=2, learning_rate=0.1, final_fraction=0.25, weight_decay=0.5)
+    found = updates_of([0.0] * 11, **settings)
+    rates = -found["w"][:, 0] / 0.5
+    np.testing.assert_allclose(rates[[0, 1, 2, 10]], [0, 0.05, 0.1, 0.025], rtol=1e-5)
+    assert (np.diff(rates[2:]) < 0).all() and not found["b"].any()
+
+
+def test_gradients_are_clipped_to_the_norm_that_is_configured():
+    """What is above it counts no more than what reaches it."""
+    above, at = (updates_of([g, 0.1, 0.1], weight_decay=0.0, clip_norm=2.0)["w"] for g in (100.0, 2 / 6**0.5))
+    np.testing.assert_allclose(above, at, rtol=1e-4)
