@@ -61,15 +61,17 @@ def test_a_branch_is_byte_equal_to_a_run_of_its_own(tmp_path: Path):
 
 
 def test_a_branch_is_on_the_disk_before_its_checkpoint_is_seen(tmp_path: Path, monkeypatch):
-    """Its logs first: a checkpoint without them, after a loss of power, is refused."""
+    """Its logs first, all of them: a checkpoint without them, after a loss of power, is refused."""
     source, branch = tmp_path / "source", tmp_path / "branch"
     (source / CHECKPOINTS / "3").mkdir(parents=True)
-    for name in (f"{CHECKPOINTS}/3/state", "metrics.jsonl"):
-        (source / name).touch()
+    logs = ["metrics.jsonl", "validation.jsonl", "timing.jsonl"]
+    for name in (f"{CHECKPOINTS}/3/state", *logs):
+        (source / name).write_text(name)
     branch.mkdir()
     done = record_writes(branch, monkeypatch)
     assert begin_from(source, branch, 5) == 3
-    assert done == ["metrics.jsonl", "branch", "state", ".3.copied", "rename", CHECKPOINTS]
+    assert done == [*logs, "branch", "state", ".3.copied", "rename", CHECKPOINTS]
+    assert [(branch / name).read_text() for name in logs] == logs
 
 
 @pytest.fixture(scope="module")

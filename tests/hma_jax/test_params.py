@@ -30,6 +30,15 @@ def test_a_table_may_be_written_with_lists_and_arrays():
     assert table == ONE_ROBOT and hash(table) == hash(ONE_ROBOT)
 
 
+def test_robots_of_a_table_have_names_of_their_own():
+    """The windows of the second would train the first."""
+    (robot,) = ONE_ROBOT.entries
+    with pytest.raises(ConfigError, match=r"embodiment names repeat: \['table', 'table'\]"):
+        EmbodimentTable((robot, robot))
+    with pytest.raises(ConfigError, match="the embodiment table is empty"):
+        EmbodimentTable(())
+
+
 class Pair(nnx.Module):
     def __init__(self, extra: bool):
         self.first = param((3, 4), ("D", None), normal(1.0), role="hidden")

@@ -62,6 +62,24 @@ def test_what_a_robot_learns_does_not_depend_on_which_others_are_trained(batch: 
     assert any(x.any() for x in found[("base",)])
 
 
+def test_gradients_of_what_is_frozen_do_not_count_towards_the_norm_to_which_others_are_clipped():
+    """A batch without the robot that is trained has no others."""
+    only = ("base",)
+    state = init_state(DECLARED, SIX, 0, state_shapes(DECLARED, SIX, only=only))
+    step = jax.jit(make_train_step(DECLARED, SIX, MODEL, train_config(batch=3, only=only, optimizer=FREE)))
+    batch = random_batch(0, MODEL, 3, SIX)
+    without, among = (
+        float(step(state, batch | {"embodiment": np.array([0, 1, robot], np.int32)})[1]["grad_norm"])
+        for robot in (3, SIX.index("base"))
+    )
+    assert without == 0 < among
+
+
+def test_robots_to_train_that_there_are_not_are_named():
+    with pytest.raises(ConfigError, match="train.only names arm, walker, but the robots are pusher, arm, base, "):
+        make_train_step(DECLARED, SIX, MODEL, train_config(only=("arm", "walker")))
+
+
 def as_before(state: TrainState) -> TrainState:
     """As versions saved it that had moments of everything: 0 of what is frozen."""
     specs, whole = declare_model(MODEL, TABLE).specs, jax.tree.map(np.zeros_like, state.params)
