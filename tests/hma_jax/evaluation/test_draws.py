@@ -58,3 +58,18 @@ def test_windows_robots_seeds_and_purposes_have_keys_of_their_own():
         for start in (0, 1, 12)
     ]
     assert len({jax.random.key_data(k).tobytes() for k in keys}) == 2 * 4 * 2 * 3 * 3
+
+
+@pytest.mark.parametrize(
+    ("purpose", "numbers"),
+    [
+        ("actions", [2954442257, 1268906379]),
+        ("decoding", [1570006489, 2543685168]),
+        ("likelihood", [602858163, 1351430469]),
+        ("policy", [3589570117, 2835087674]),
+    ],
+)
+def test_the_keys_of_a_window_are_those_of_every_version(purpose, numbers):
+    """Results that different ones made are compared."""
+    (key,) = window_keys(3, purpose, TABLE, *jnp.array([[1], [7], [12]]))
+    assert jax.random.key_data(key).tolist() == numbers
