@@ -54,6 +54,17 @@ def test_the_better_steps_are_found_and_every_window_is_judged_once():
         cross_fit({100: table, 200: replace(table, episode=table.episode + 1)}, ROBOTS)
 
 
+def test_windows_are_matched_in_whatever_order_they_stand():
+    """Else steps were chosen on episodes that they are judged on."""
+    rng = np.random.default_rng(0)
+    table = judged(rng, robots=2, episodes=8, mean=2.0)
+    first, second = (noisy(rng, table) for _ in range(2))
+    mixed = second.rows(rng.permutation(len(second)))
+    (straight, chosen), (shuffled, again) = (cross_fit({1: first, 2: other}, ROBOTS) for other in (second, mixed))
+    assert chosen == again
+    np.testing.assert_array_equal(straight.metrics["cross_entropy"], shuffled.metrics["cross_entropy"])
+
+
 def test_steps_at_either_end_of_those_tried_are_said_to_be():
     """Fewer or more may be better still."""
     table = judged(np.random.default_rng(0), robots=2, episodes=4)

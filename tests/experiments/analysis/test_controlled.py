@@ -109,3 +109,12 @@ def test_seeds_that_differ_make_the_error_larger():
     own = [next(r for r in rows if r.metric == "delta_psnr") for rows in (one, three)]
     assert own[1].seeds == 3 and own[1].sem > 3 * own[0].sem
     assert own[1].mean == pytest.approx(own[0].mean + 1)
+
+
+def test_seeds_are_compared_window_by_window_in_whatever_order_they_have_them():
+    one, other = model(1.0), model(0.5)
+    mixed = other.rows(np.random.default_rng(0).permutation(len(other)))
+    straight, shuffled = (controllability({0: one, 1: table}, rate=2.0) for table in (other, mixed))
+    for a, b in zip(straight, shuffled, strict=True):
+        assert (a.robot, a.metric) == (b.robot, b.metric)
+        np.testing.assert_allclose([a.mean, a.sem, a.low, a.high], [b.mean, b.sem, b.low, b.high], rtol=1e-6)
