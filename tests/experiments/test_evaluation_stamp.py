@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from data_pipelines.windows.evalset import DatasetWindows
 from experiments.cli.evaluate import MEANS, table_of, trained_on_other_tokens, write_results
 from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, require_same_evaluation
 from experiments.preparing.made_from import MadeFrom
@@ -132,6 +133,27 @@ def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
     with pytest.raises(ConfigError) as refused:
         require_same(tmp_path, wanted)
     assert line in str(refused.value) and "--to DIR" in str(refused.value) and "--replace" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"weights": "average"}, {"tokenizer": "other"}, {"frames": 5}, {"rate": 4.0}, {"tokens": "other"},
+        {"windows": ((0, 0), (1, 8))},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)  # fmt: skip
+def test_whatever_the_numbers_depend_on_makes_another_evaluation(changed):
+    def inputs(weights="last", tokenizer="t", frames=4, rate=2.0, tokens="s", windows=((0, 0), (1, 4))):
+        prepared = SimpleNamespace(
+            manifest=SimpleNamespace(datasets=(DatasetWindows("arm", windows),), frames=frames, rate=rate),
+            tokenizer=SimpleNamespace(identity=tokenizer),
+            store=SimpleNamespace(hash=lambda _: tokens),
+        )
+        trained = SimpleNamespace(**vars(TRAINED) | {"weights": weights})
+        return describe_evaluation(trained, ("arm",), prepared, EvalConfig()).inputs
+
+    assert inputs(**changed) != inputs()
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from experiments.applications.generating.survey import survey
 from experiments.applications.generating.trajectories import describe, describe_training, open_trajectories
 from experiments.cli.main import main
 from experiments.simulators import load_simulator
-from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
+from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.evaluation.metrics import MAX_PSNR
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.simulator.folder import save_robots
@@ -269,6 +270,33 @@ def test_actions_in_other_units_are_told_and_refused(gnm, tmp_path):
     other = replace(robot, low=(-3.0, -3.0), high=(3.0, 1.0))
     with pytest.raises(ConfigError, match="hardly its raw units.*--allow-clipping"):
         survey(recorded, 2, other).require_raw_units()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"checkpoint": "other"}, {"step": 4}, {"tokenizer": "u"}, {"decode": DecodeConfig(3, 0.5)}, {"seed": 1},
+        {"given": 2}, {"count": 4}, {"fingerprint": "other"}, {"split": "val"},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)  # fmt: skip
+def test_what_was_generated_in_another_way_is_another_dataset(changed):
+    spec, robot = get_spec("berkeley_gnm_cory_hall"), Robot("other", 2, (0.0,) * 2, (1.0,) * 2, (0.0,) * 2)
+
+    class Fake:
+        def __init__(self, step=3, tokenizer="t", decode=DecodeConfig()):
+            self.model, self.decode = SimpleNamespace(table=None, step=step), decode
+            self.tokenizer = SimpleNamespace(image_shape=(8, 8), identity=tokenizer)
+
+        def __len__(self):
+            return 3
+
+    def identity(checkpoint="c", seed=0, given=1, count=5, fingerprint="f", split="train", **of_simulator):
+        recorded = SimpleNamespace(name=spec.name, split=split, fingerprint=fingerprint, spec=spec, observed={})
+        own = {"given": given, "count": count, "seed": seed, "checkpoint": checkpoint}
+        return source_module.GeneratedSource(Fake(**of_simulator), robot, recorded, **own).identity()
+
+    assert identity(**changed) != identity()
 
 
 def test_another_rate_of_the_recordings_is_another_dataset(gnm, tmp_path):

@@ -15,6 +15,7 @@ import pytest
 from data_pipelines.suite.environment import Environment
 from experiments.applications import plan_actions
 from experiments.applications.plan_actions import (
+    CLONED,
     PLANNERS,
     Settings,
     besides_settings,
@@ -42,6 +43,7 @@ PAGE = Path(__file__).parents[3] / "docs/planning.md"
 SEARCHES = list(dict.fromkeys(by for by, _ in PLANNERS.values()))
 CONFIG = SearchConfig(candidates=16, iterations=4, knots=3, hold=2)
 TARGET = np.array([[0.6, -0.5], [0.1, 0.4], [-0.7, 0.2]])
+STRIDE_3 = Robot("pusher_sand", 3, (-8.8, -8.8), (8.8, 8.8), (0.0, 0.0))
 
 
 def search(by, seed: int = 0, config: SearchConfig = CONFIG):
@@ -320,6 +322,29 @@ def test_every_search_and_every_start_samples_with_its_own_numbers(temperature, 
     shared = [seeds[0] for seeds in simulator.asked]
     assert [seeds == seeds[:1] * 2 for seeds in simulator.asked] == [True] * len(shared) and len(shared) >= 4
     assert len(set(shared)) == (len(shared) if temperature else 2)
+
+
+def test_an_action_is_carried_out_for_as_many_native_steps_as_a_frame_has(monkeypatch):
+    steps: list[list[float]] = []
+
+    class Watched(Environment):
+        def step(self, action):
+            steps.append(action.tolist())
+            super().step(action)
+
+    monkeypatch.setattr(plan_actions, "Environment", Watched)
+    settings = Settings(frames=7, hold=6, search=SearchConfig(candidates=4, iterations=1))  # decided after one frame
+    plan_actions.run_planner("MPPI in the model", Recorder(), STRIDE_3, settings, int(settings.start_seeds()[0]))
+    assert len(steps) == 3 and steps == steps[:1] * 3
+
+
+def test_a_cloned_policy_learns_and_acts_at_the_rate_of_the_model(monkeypatch):
+    asked, none = {}, SimpleNamespace(success=[], distance=[])
+    monkeypatch.setattr(plan_actions, "record", lambda task, count, **how: asked.update(how))
+    monkeypatch.setattr(plan_actions, "clone", lambda *_: "policy")
+    monkeypatch.setattr(plan_actions, "run_policy", lambda *given: asked.update(ran=given) or none)
+    plan_actions.run_cloned(Settings(), STRIDE_3, np.arange(2), 32, next(iter(CLONED)), lambda *_: None)
+    assert asked["stride"] == 3 and asked["image_size"] == 32 and asked["ran"][3:] == (32, 3)
 
 
 def test_the_picture_of_the_goal_is_of_an_expert_that_had_the_time_of_two_episodes():

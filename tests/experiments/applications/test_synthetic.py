@@ -15,7 +15,7 @@ import pytest
 from data_pipelines.suite.generate import generate_suite
 from experiments.analysis.bootstrap import bootstrap_intervals
 from experiments.applications import synthetic
-from experiments.applications.generating import conditions
+from experiments.applications.generating import conditions, demonstration_sources
 from experiments.applications.generating.conditions import (
     ALL,
     CONDITIONS,
@@ -29,6 +29,7 @@ from experiments.applications.generating.conditions import (
 )
 from experiments.applications.generating.demonstration_sources import (
     RecordedSource,
+    ScriptedSource,
     Settings,
     Training,
     shuffled_actions,
@@ -158,6 +159,27 @@ def test_policies_are_trained_and_judged_through_the_tokenizer_if_that_was_asked
     ((_, seen, _, through),) = got
     assert (through is not None) == asked == (seen[0] == "reconstructed" if asked else False)
     assert not asked or seen[2] == (through, 1)
+
+
+def test_errors_of_all_policies_are_in_one_unit_and_every_policy_has_its_own_seed(monkeypatch):
+    """That of the recordings, whatever a policy was trained on."""
+    scales, seeds = [], []
+    monkeypatch.setattr(synthetic, "clone", lambda demos, config, seed, update: seeds.append(seed))
+    monkeypatch.setattr(synthetic, "action_errors", lambda policy, demos, scale: scales.append(scale) or np.zeros(1))
+    source, data = SimpleNamespace(settings=Settings(), judge=lambda policy: {}), DATA | {"held_out": DATA["recorded"]}
+    for condition, seed in ((CONDITIONS[FEW], 3), (CONDITIONS[MOST], 4)):
+        run_trial(source, condition, data, seed, lambda *_: None)
+    assert scales == [scale_of(DATA["recorded"])] * 2 and seeds == [3, 4]
+
+
+def test_the_held_out_demonstrations_of_the_scripted_expert_are_other_episodes(monkeypatch):
+    asked, made = [], SimpleNamespace(seeds=None, take=lambda rows: rows)
+    monkeypatch.setattr(demonstration_sources, "record", lambda *_, seed, **__: asked.append(seed) or made)
+    monkeypatch.setattr(demonstration_sources, "start_distances", lambda *_: np.ones(200))
+    source = ScriptedSource(Settings(), Robot("gripper_wood", 1, (0.0,) * 4, (1.0,) * 4, (0.0,) * 4), 32)
+    source.record()
+    source.record_held_out()
+    assert len(set(asked)) == 2
 
 
 def test_every_control_s_share_is_that_of_its_own_trials_whichever_were_tried():

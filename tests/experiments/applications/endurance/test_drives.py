@@ -42,6 +42,15 @@ def test_robots_of_one_rate_draw_apart(start, monkeypatch):
     assert first != second
 
 
+def test_a_drive_draws_its_behaviour_by_its_seed_and_anew_after_some_time(start, monkeypatch):
+    began, behaviour = [], drives.Behaviour
+    monkeypatch.setattr(drives, "RESTART_SECONDS", 5 / ROBOT.hz)
+    monkeypatch.setattr(drives, "Behaviour", lambda *given: began.append(0) or behaviour(*given))
+    first, again, other = (make_drive(ROBOT, start, 12, "behaviour", seed).actions for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any() and len(began) == 3 * 3
+
+
 def test_actions_unlike_the_data(start):
     extremes = make_drive(ROBOT, start, 80, "extremes", seed=0).actions
     hold = round(HOLD_SECONDS * ROBOT.hz)

@@ -17,6 +17,7 @@ from experiments.applications.endurance.films import Film, make_films
 from experiments.applications.endurance.hidden import Event, judge
 from experiments.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, actions, simulator, start
@@ -45,6 +46,27 @@ class Driven:
 def watch(name: str, frames: np.ndarray) -> SimpleNamespace:
     grey = frames.mean((1, 2, 3))
     return SimpleNamespace(position=grey[:, None, None] * [[[1, 2]]], confidence=grey[:, None] / 255)
+
+
+def test_each_frame_of_a_film_is_measured_beside_the_true_one_of_the_same_time():
+    rng, times = np.random.default_rng(0), np.arange(11.0)
+    film, true = rng.integers(0, 256, (2, 4, 8, 8, 3), np.uint8)
+    first = rng.integers(0, 256, (8, 8, 3), np.uint8)
+    points = SimpleNamespace(position=np.repeat(times[:, None, None], 2, 2), share=times[:, None] / 10)
+    drive = SimpleNamespace(robot=SimpleNamespace(name="a"))
+    found = films._measure_block(SimpleNamespace(detect=watch), drive, points, 5, film, true, first)
+    film, true = film[1:], true[1:]
+    seen, seen_true = watch("a", film), watch("a", true)
+    grey, true_grey = (images.astype(float).reshape(3, -1) for images in (film, true))
+    expected = {
+        "psnr": psnr(film, true), "still": psnr(np.stack([first] * 3), true),
+        "true_position": [[[6, 6]], [[7, 7]], [[8, 8]]], "true_share": [[0.6], [0.7], [0.8]],
+        "position": seen.position, "confidence": seen.confidence,
+        "seen_position": seen_true.position, "seen_confidence": seen_true.confidence,
+        "level": grey.mean(1) - true_grey.mean(1), "variance": grey.var(1) / true_grey.var(1),
+    }  # fmt: skip
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-5, err_msg=name)
 
 
 @pytest.mark.slow

@@ -62,7 +62,8 @@ def test_where_nothing_is_hidden_that_is_said(watch):
         watch("first", some=False)
 
 
-def test_a_row_says_how_far_its_object_moved_since_it_was_last_seen():
+def test_a_row_says_how_far_its_object_moved_and_how_far_off_it_is_found():
+    """Here it is found where it is in the model's frames, which are black, and where it was before in the true one."""
     spec, lag = SPECS[ROBOT.name], 20
     rollout = simulate(spec, episode_seeds(spec, 4, 0, "val"))
     positions = [
@@ -72,15 +73,20 @@ def test_a_row_says_how_far_its_object_moved_since_it_was_last_seen():
     far = [np.linalg.norm(at[3 + lag] - at[3], axis=-1)[1:] for at in positions]  # without the tool
     episode = int(np.argmax([x.max() for x in far]))
     point = 1 + int(far[episode].argmax())
-    images, points = np.zeros((1, 64, 64, 3), np.uint8), len(point_names(spec))
+    black = np.zeros((1, 64, 64, 3), np.uint8)
     simulator = SimpleNamespace(
-        robots={ROBOT.name: ROBOT}, tokenizer=SimpleNamespace(image_size=64), reset=lambda *_, **__: images,
-        step=lambda _: images,
+        robots={ROBOT.name: ROBOT}, tokenizer=SimpleNamespace(image_size=64), reset=lambda *_, **__: black,
+        step=lambda _: black,
     )  # fmt: skip
-    detector = SimpleNamespace(detect=lambda *_: Detections(np.zeros((1, points, 2)), np.zeros((1, points))))
+
+    def detect(robot: str, images: np.ndarray) -> Detections:
+        t = 3 if images.any() else 3 + lag
+        return Detections(positions[episode][[t]], np.ones((1, len(point_names(spec)))))
+
     event = hidden.Event("control", episode, 3, point, 0, lag)
-    (row,) = hidden.judge(simulator, detector, spec, rollout, [event])
-    assert row["moved_px"] == pytest.approx(far[episode].max()) and row["moved_px"] > 4
+    (row,) = hidden.judge(simulator, SimpleNamespace(detect=detect), spec, rollout, [event])
+    assert row["moved_px"] == row["true_px"] == pytest.approx(far[episode].max()) and row["moved_px"] > 4
+    assert (row["px"], row["close"], row["true_close"]) == (0, 1, 0)
 
 
 def test_the_model_is_judged_at_the_end_of_each_event_under_the_actions_recorded_until_then():

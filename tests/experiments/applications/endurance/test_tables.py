@@ -9,7 +9,7 @@ import pytest
 
 from experiments.applications.endurance.__main__ import main, print_rows, true_starts_of
 from experiments.applications.endurance.films import Film, colour_histogram, load_films, save_films
-from experiments.applications.endurance.hidden import MIN_HIDDEN, find_events
+from experiments.applications.endurance.hidden import HORIZON, MIN_HIDDEN, find_events
 from experiments.applications.endurance.tables import MEASURES, measure, motion, over_robots, read_rows, rows_of
 from experiments.tables import write_rows
 from hma_jax.config import ConfigError
@@ -142,3 +142,11 @@ def test_events_are_of_what_vanishes_and_comes_back():
     share[3, 11, 1] = 1.0
     ended = np.array([20, 20, 20, 11])  # the frame before
     assert [e.kind for e in find_events(share, ended, 1, np.random.default_rng(0))] == ["hidden"]
+
+
+def test_what_comes_back_after_too_long_is_no_event():
+    share = np.ones((2, HORIZON + 20, 2), np.float32)
+    share[0, 6 : 6 + HORIZON, 1] = 0.0  # back one frame too late
+    share[1, 6 : 5 + HORIZON, 1] = 0.0
+    events = find_events(share, np.full(2, HORIZON + 20), 1, np.random.default_rng(0))
+    assert [(e.episode, e.lag) for e in events if e.kind == "hidden"] == [(1, HORIZON)]
