@@ -73,6 +73,15 @@ def test_annotated_frames_are_joined_in_time_and_sampled_evenly(tmp_path):
     np.testing.assert_allclose(dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6)
 
 
+def test_frames_are_counted_at_the_rate_of_the_annotations(tmp_path):
+    """Not at that of a video which was encoded anew at another one: frame 20 of 20 per second is at 1 s."""
+    frames, about = [annotated(n) for n in (0, 10, 20, 30, 40)], {"fps": 20.0, "width": 200, "height": 100}
+    done = convert(ego4d(tmp_path, action(*frames), video_metadata=about), tmp_path, "ego4d")
+    _, (episode,) = read_back(done.directory, "observation/image")
+    assert [number(image) for image in episode.images] == [0, 5, 10, 15]  # the video has 10 per second
+    np.testing.assert_allclose(episode.actions[:, 0] * 200, [10, 20, 30, 40], atol=1e-4)
+
+
 def test_a_pause_ends_an_episode_and_unusable_frames_do_not_bridge_it(tmp_path):
     frames = [annotated(n) for n in (0, 5, 10)] + [annotated(n) for n in (30, 35, 40, 45)]
     middle = [annotated(20, ("left_hand",)), annotated(21, ())]  # without both hands

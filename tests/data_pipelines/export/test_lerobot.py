@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -246,6 +247,18 @@ def test_an_existing_directory_is_returned_or_refused(tmp_path):
         one_per_file(source, tmp_path / "new")
     with pytest.raises(ConfigError, match="was not made by this command"):
         export(source, tmp_path / "toy")
+
+
+def test_a_dataset_of_other_fields_of_another_rate_or_of_other_recordings_is_refused(tmp_path):
+    source, longer = (open_source(write_rlds(tmp_path / str(last), make_spec(), [3, last])) for last in (3, 4))
+    fields, new = choose_fields(source), tmp_path / "new"
+    export_lerobot(source, fields, new, 2.0)
+    renamed = replace(fields, cameras={f"{camera}_2": key for camera, key in fields.cameras.items()})
+    fewer = choose_fields(source, ["action[:1]"])
+    for other in ((source, fewer, new, 2.0), (source, renamed, new, 2.0), (source, fields, new, 3.0),
+                  (longer, fields, new, 2.0)):  # fmt: skip
+        with pytest.raises(ConfigError, match="was made from another dataset or with other settings"):
+            export_lerobot(*other)
 
 
 def test_a_source_without_a_readable_episode_is_refused(tmp_path):

@@ -19,15 +19,16 @@ def points(monkeypatch):
     use_points(monkeypatch)
 
 
-def starts(count: int = 2) -> list[Start]:
-    return physics_starts(DRAWER.name, count, 3, stride=DRAWER.stride, image_size=8)
+def starts(count: int = 2, seed: int = 0) -> list[Start]:
+    return physics_starts(DRAWER.name, count, 3, stride=DRAWER.stride, image_size=8, seed=seed)
 
 
 def test_an_episode_is_begun_again_where_its_start_ends():
     found, sim = starts(), PhysicsSimulator([DRAWER], episodes=2, image_size=8)
     assert [s.images.shape for s in found] == [(3, 8, 8, 3)] * 2 and found[0].actions.shape == (10, 4)
     np.testing.assert_array_equal(sim.reset(found), [s.images[-1] for s in found])
-    assert [s.seed for s in found] == new_seeds(DRAWER.name, 2, 0, "starts").tolist()
+    for seed in (0, 2):
+        assert [s.seed for s in starts(2, seed)] == new_seeds(DRAWER.name, 2, seed, "starts").tolist()
     assert [s.seed for s in starts(1)] == [found[0].seed]
 
 

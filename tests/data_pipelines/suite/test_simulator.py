@@ -26,6 +26,11 @@ def test_a_start_goes_on_as_its_own_actions_did(asked, stride):
     np.testing.assert_array_equal(begun.step([start.actions[stride : 2 * stride]])[0], start.images[2])
 
 
+def test_starts_of_another_seed_are_of_other_episodes():
+    first, other = ({start.seed for start in suite_starts("pusher_sand", 4, 2, seed=seed)} for seed in (0, 2))
+    assert first and other and not first & other
+
+
 def test_episodes_are_apart_clipped_and_taken_back(monkeypatch):
     sim = SuiteSimulator([PUSHER, ARM], episodes=2)
     starts = [suite_starts("pusher_sand", 8, 1)[0], suite_starts("arm_chalk", 8, 1)[0]]

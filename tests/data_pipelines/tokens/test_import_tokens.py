@@ -183,6 +183,17 @@ def test_a_second_run_does_nothing_and_other_folders_are_refused(tmp_path, pair)
         import_tokens(*pair, tmp_path / "store", hz=6)
 
 
+@pytest.mark.parametrize("file", ["actions/part_0.bin", "segment_ids.bin"])
+def test_folders_that_changed_are_not_taken_for_those_that_were_imported(file, tmp_path, pair):
+    """Else actions that were corrected stayed the old ones in the store."""
+    import_tokens(*pair, tmp_path / "store", hz=4)
+    values = np.fromfile(pair[0] / file, np.int32 if file.startswith("segment") else np.float32)
+    values[-1] += 1  # the last frame is an episode of its own, or has another action
+    values.tofile(pair[0] / file)
+    with pytest.raises(ConfigError, match="already tokenised with other settings .source: "):
+        import_tokens(*pair, tmp_path / "store", hz=4)
+
+
 def test_folders_that_do_not_belong_together_are_refused(tmp_path, pair):
     latents = write_folder(tmp_path / "latents", latents=True)
     with pytest.raises(ConfigError, match="do not belong together: .*channels: 0 -> 16"):

@@ -248,3 +248,13 @@ def test_the_rate_is_that_of_the_frames(tmp_path):
 def test_unknown_dataset_is_named(store, table, manifest):
     with pytest.raises(ConfigError, match="not in the evaluation set: leg"):
         eval_batches(store, table, manifest, 2, ("leg",))
+
+
+def test_frames_that_are_none_are_marked_whichever_dataset_has_them(tmp_path):
+    """Else padding counted as frames where the last dataset has whole windows."""
+    small_store(tmp_path, "a", [3] * 4)
+    store = small_store(tmp_path, "b")
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2, rate=2.0)
+    assert frozen.least == 3
+    batch = next(eval_batches(store, store.embodiment_table(store.names, rate=2.0), frozen, 12))
+    assert [real.sum() for real in batch["real"]] == [3 if name == "a" else 4 for name in batch["dataset"]]
