@@ -230,6 +230,7 @@ def test_paper_preset_has_the_papers_sizes():
     assert PAPER.dataset_counts == (5, 10, 20, 30, 40) and len(PAPER.datasets) == 40
     assert (PAPER.model.frames, PAPER.model.tokens, PAPER.model.layers, PAPER.model.action_tokens) == (12, 256, 32, 64)
     assert (PAPER.train.steps, PAPER.train.batch, PAPER.tau) == (60_000, 64, 3.0)
+    assert PAPER.store.frame_step == 1  # as the published shares of the mixture need
     assert PAPER.widths == (64, 128, 256, 512, 768)
     assert PAPER.trajectory_counts == tuple(10**n for n in range(1, 7))
     reference = reference_trial(PAPER, 0)

@@ -8,6 +8,7 @@ import pytest
 
 from data_pipelines.errors import DataError
 from data_pipelines.loading.selection import LoaderConfig, select_windows
+from data_pipelines.sampling.mixture import mixture_weights
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.windows.slicer import WindowSlicer
@@ -39,6 +40,20 @@ def test_windows_are_the_longest_that_lie_inside_one_episode(stride, frame_step,
     assert [found.locate(i) for i in range(len(found))] == expected
     assert found.too_short == sum(r < least for r in real)
     assert found.padded == sum(least <= r < frames for r in real)
+
+
+def test_shares_of_the_mixture_are_the_release_s_if_every_native_frame_is_stored():
+    """Three robots with equally long recordings, at 2, 10 and 30 Hz. Of the frames of each remainder modulo the stride
+    the release makes windows that do not overlap (reference section 5.6)."""
+    seconds, strides = [300, 450, 600], np.array([1, 5, 15])
+    released = [sum(len(range(r, 2 * s * n, s)) // 12 for n in seconds for r in range(s)) for s in strides]
+
+    def shares(steps_of) -> np.ndarray:
+        stores = [OneDataset([2 * s * n for n in seconds], hz=2 * s, frame_step=steps_of(s)) for s in strides]
+        return mixture_weights([len(train_windows(store, "toy", 12, rate=2.0)) for store in stores], 3.0)
+
+    np.testing.assert_allclose(shares(lambda _: 1), mixture_weights(released, 3.0), rtol=0.01)
+    np.testing.assert_allclose(shares(lambda stride: stride), 1 / 3)
 
 
 def item_of(steps: int, frame_step: int) -> StoredEpisode:
