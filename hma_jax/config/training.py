@@ -35,7 +35,9 @@ class MaskingConfig:
     """Training-time masking and corruption (reference sections 1.9 and 2.3, paper section 3.5)."""
 
     setting: MaskingSetting = "forward"  # what is masked in training, and so predicted (docs/models.md)
-    action_loss_weight: float = 0.5  # weight of the action loss, if frames are predicted too; theirs has weight 1
+    # Weight of the action loss beside that of frames, if these are predicted too. DIFFERS: in the release's continuous
+    # variant it is 1 by default; here 0.5 for both.
+    action_loss_weight: float = 0.5
     non_mlm_ratio: float = 0.2  # probability that the prompt frames of a window are not masked
     prompt_frames: int = 4  # number of prompt frames, the first of a window
     # Mask rate of a frame: cos(pi/2 u), with u uniform between this value and 1. DIFFERS: the release calls

@@ -100,7 +100,9 @@ def draw(key: jax.Array, config: ModelConfig, masking: MaskingConfig) -> Masking
 def corrupt(tokens_TS: jax.Array, draws: MaskingDraws, config: ModelConfig, masking: MaskingConfig) -> jax.Array:
     """Random-token corruption, and degradation of late frames in prompt mode (reference section 1.9).
 
-    In prompt mode (first_masked > 1) frames from first_masked on are degraded, later ones more.
+    In prompt mode (first_masked > 1) frames from first_masked on are degraded, later ones more. DIFFERS: with a prompt
+    of one frame (`prompt_frames` 1) a first_masked of 1 that was drawn in prompt mode is not told apart, and degrades
+    nothing; the release's would.
     """
     ids = factorise(tokens_TS, config.factors, config.factor_vocab)
     replace = draws.u_replace_TSQ < masking.max_corrupt_rate * draws.u_corrupt

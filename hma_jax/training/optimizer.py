@@ -62,7 +62,8 @@ def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
     else:
         decay = decay_steps(config, steps)
         after = optax.linear_schedule(peak, end, decay, transition_begin=max(rest - decay, 0))
-    # Step 0 already moves: the ramp is (step + 1) / warmup, as in the release.
+    # Step 0 already moves: the ramp is (step + 1) / warmup. DIFFERS: so it is in the release's cosine schedule, but its
+    # default, the constant one, has step / warmup, so that the first update does nothing (reference section 4.1).
     ramp = optax.linear_schedule(peak / max(warmup, 1), peak, max(warmup - 1, 1))
     return optax.join_schedules([ramp, after], [warmup])
 
