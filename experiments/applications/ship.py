@@ -15,7 +15,6 @@ clip.gif shows the first of these episodes.
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 import sys
@@ -31,6 +30,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from data_pipelines.publishing.files import publish
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
 from experiments.bench.simulate import time_simulator
+from experiments.report.pieces import animation
 from experiments.running.machine import describe_machine
 from experiments.running.run_options import UNSET
 from experiments.simulators import held_out, in_suite, load_simulator, save_beside, true_simulator
@@ -185,9 +185,7 @@ def write_clip(rollouts: Mapping[str, Rollouts], path: Path, hz: float) -> None:
     smooth = [Image.fromarray(frame).resize(size, Image.Resampling.BICUBIC) for frame in film]  # as the page shows them
     palette = Image.fromarray(np.concatenate(smooth)).quantize(COLOURS)
     larger = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in smooth]
-    content = io.BytesIO()
-    larger[0].save(content, "GIF", save_all=True, append_images=larger[1:], duration=round(1000 / hz), loop=0)
-    write_file(path, content.getvalue())
+    write_file(path, animation(larger, round(1000 / hz), "GIF"))
 
 
 def frames_of(simulator: Simulator | SuiteSimulator, starts: Sequence[Start], futures: np.ndarray):

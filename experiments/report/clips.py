@@ -7,14 +7,13 @@ grey while frames are given, coloured while they are predicted. On paper, where 
 from __future__ import annotations
 
 import html
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from experiments.report.pieces import STILL, frames, moving
+from experiments.report.pieces import STILL, animation, frames, moving
 
 KINDS = {"true": "recorded", "predicted": "predicted", "random": "other actions"}
 """Keys of samples.npz, with their captions."""
@@ -78,12 +77,7 @@ def animate(clips: Sequence[np.ndarray], prompt: int) -> bytes:
         past, given = (round(whole * n / count) for n in (t + 1, min(t + 1, prompt)))
         picture[-BAR:, :past], picture[-BAR:, :given] = PREDICTED, GIVEN
         pictures.append(Image.fromarray(picture))
-    buffer = io.BytesIO()
-    pictures[0].save(
-        buffer, "WEBP", save_all=True, append_images=pictures[1:], lossless=True, method=4, quality=80, loop=0,
-        duration=[SHOW_MS] * (count - 1) + [HOLD_MS],
-    )  # fmt: skip
-    return buffer.getvalue()
+    return animation(pictures, [SHOW_MS] * (count - 1) + [HOLD_MS], lossless=True, method=4, quality=80)
 
 
 def strip(title: str, rows: Mapping[str, np.ndarray], prompt: int) -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import html
-import io
 from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image
 
-from experiments.report.pieces import moving
+from experiments.report.pieces import animation, moving
 
 WIDTH = 300
 """Units of a drawing's width; pages scale it."""
@@ -21,12 +20,8 @@ def clip(frames: Sequence[np.ndarray], seconds: float, height: int, title: str) 
     # Small images keep their pixels; large ones are averaged.
     way = Image.Resampling.NEAREST if frames[0].shape[0] < height else Image.Resampling.BOX
     pictures = [Image.fromarray(frame).resize((width, height), way) for frame in frames]
-    buffer = io.BytesIO()
-    pictures[0].save(
-        buffer, "WEBP", save_all=True, append_images=pictures[1:], loop=0, quality=60, method=3,
-        duration=max(round(1000 * seconds / len(pictures)), 20),
-    )  # fmt: skip
-    return moving(buffer.getvalue(), title, f"class=clip width={width} height={height}", lossless=False)
+    film = animation(pictures, max(round(1000 * seconds / len(pictures)), 20), quality=60, method=3)
+    return moving(film, title, f"class=clip width={width} height={height}", lossless=False)
 
 
 def curves(rows: np.ndarray, lows: Sequence[float], highs: Sequence[float], names: Sequence[str]) -> str:

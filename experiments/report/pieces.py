@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -78,13 +79,23 @@ def picture(path: Path, alt: str) -> str:
     return f'<div class=scroll><img class=plot style="{wide}" alt="{alt}" src="{data_uri(content)}"></div>'
 
 
-def moving(animation: bytes, alt: str, attributes: str, lossless: bool = True) -> str:
+def animation(
+    pictures: Sequence[Image.Image], milliseconds: int | Sequence[int], kind: str = "WEBP", **how: Any
+) -> bytes:
+    """Pictures that follow each other, over and over: all for the same time, or each for its own. `how`: Pillow's
+    options for this `kind` of file."""
+    buffer = io.BytesIO()
+    pictures[0].save(buffer, kind, save_all=True, append_images=pictures[1:], loop=0, duration=milliseconds, **how)
+    return buffer.getvalue()
+
+
+def moving(film: bytes, alt: str, attributes: str, lossless: bool = True) -> str:
     """An animated WebP, and its last frame for readers who prefer less motion. `attributes`: those of both elements."""
     still = io.BytesIO()
-    with Image.open(io.BytesIO(animation)) as film:
-        film.seek(film.n_frames - 1)
-        film.convert("RGB").save(still, "WEBP", lossless=lossless, method=4, quality=80)
-    pictures = {"moving": animation, "still": still.getvalue()}
+    with Image.open(io.BytesIO(film)) as frame:
+        frame.seek(frame.n_frames - 1)
+        frame.convert("RGB").save(still, "WEBP", lossless=lossless, method=4, quality=80)
+    pictures = {"moving": film, "still": still.getvalue()}
     return "".join(
         f'<span class={kind}><img {attributes} alt="{html.escape(alt)}" src="{data_uri(content, "webp")}"></span>'
         for kind, content in pictures.items()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import html
-import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from experiments.analysis.intervals import Interval
 from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.judging.judge import Judgement
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, Outcome
-from experiments.report.pieces import data_uri
+from experiments.report.pieces import animation, data_uri
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.files import write_file
 
@@ -119,12 +118,7 @@ def write_blind(judged: Judgement, out: Path, clips: int = 60) -> Path:
 def _film(images: np.ndarray) -> bytes:
     frames = [Image.fromarray(image) for image in images]
     larger = [f.resize((ENLARGED * f.width, ENLARGED * f.height), Image.Resampling.NEAREST) for f in frames]
-    buffer = io.BytesIO()
-    larger[0].save(
-        buffer, "WEBP", save_all=True, append_images=larger[1:], quality=70, method=2, loop=0,
-        duration=[SHOW_MS] * (len(larger) - 1) + [HOLD_MS],
-    )  # fmt: skip
-    return buffer.getvalue()
+    return animation(larger, [SHOW_MS] * (len(larger) - 1) + [HOLD_MS], quality=70, method=2)
 
 
 def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
