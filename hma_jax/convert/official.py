@@ -145,6 +145,12 @@ def import_remarks(run: Run) -> list[str]:
             "and un-normalises what they give (docs/reference.md, section 9.1); its frames are not affected. To "
             "predict actions, train it further here (hma train --from): here targets are normalised"
         )
+    steps = run.provenance["official"]["config"].get("num_sampling_steps", "100")
+    if run.model.diffusion and str(steps) != "100":
+        remarks.append(
+            f"num_sampling_steps is {steps!r}: settings decide with how many steps frames are sampled here. For as many as "
+            f"in the release: --set eval.decode.sampler.kind=ddpm --set eval.decode.sampler.steps={steps}"
+        )
     constant = [
         f"{e.name} ({', '.join(str(i) for i, std in enumerate(e.std) if 0 < std <= DEAD_STD)})"
         for e in run.table.entries

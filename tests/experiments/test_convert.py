@@ -15,7 +15,8 @@ from safetensors.numpy import load_file
 from data_pipelines.registry import get_spec
 from data_pipelines.registry.toml_file import load_entries
 from experiments.cli.main import main
-from experiments.presets import PRESETS
+from experiments.presets import PRESETS, get_preset
+from experiments.user_input.override import override
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.convert.release_limits import require_official
 from hma_jax.convert.run_directory import fresh_state
@@ -74,6 +75,21 @@ def test_a_released_model_comes_with_the_rates_that_give_its_strides_and_the_com
     first, second = (shlex.split(part) for part in command.split("&&"))
     assert first[:2] == ["hma", "tokenize"] and second[:3] == ["hma", "evaluate", str(run)] and first[2:] == second[3:]
     assert str(run / "rates.toml") in first and "model.frames=3" in first and "eval.prompt_frames=1" in first
+
+
+def test_the_page_s_settings_sample_latents_as_the_release_does(tmp_path, capsys):
+    """Added to the command that the conversion prints (reference sections 2.5, 3.3 and 6.1)."""
+    start, run = make_checkpoint(tmp_path / "a", CONTINUOUS, [("push", 2, 1)], use_mup=False), tmp_path / "run"
+    assert main(["convert", "from-official", str(start), "--out", str(run)]) == 0
+    (preset,) = set(re.findall(r"--preset (\S+)", capsys.readouterr().out))
+    (line,) = re.findall(
+        r'^L="(--preset .*?)"$', (ROOT / "docs" / "checkpoints.md").read_text(), re.DOTALL | re.MULTILINE
+    )
+    assert f"--preset {preset} " in line
+    study = override(get_preset(preset), re.findall(r"--set (eval\.\S+)", line))
+    sampler = SamplerConfig("ddpm", 100, 0.0, scale_initial_noise=False)
+    assert study.eval.decode == DecodeConfig(unmask_steps=4, sampler=sampler, resample=True)
+    assert (study.eval.context, study.eval.windows_per_dataset) == ("recorded", 200)
 
 
 def test_robots_whose_frames_are_others_here_get_no_rate_and_swapped_colours_are_said(tmp_path, capsys):

@@ -131,6 +131,7 @@ def test_what_a_model_predicts_goes_there_and_back(setting, tmp_path):
         (CONTINUOUS, {"use_mup": False, "jointly_predict_actions": True}, "actions that it predicts are wrong"),
         (CONTINUOUS, {}, "width is 16.* multiplied by 1 here"),
         (CONTINUOUS, {"d_model": 256}, None),
+        (CONTINUOUS, {"use_mup": False, "num_sampling_steps": "25"}, "num_sampling_steps is '25': .*sampler.steps=25$"),
     ],
     ids=str,
 )
