@@ -22,6 +22,7 @@ from data_pipelines.json_file import read_lines, read_object
 from data_pipelines.names import quote, safe_join
 from data_pipelines.sources.parquet_rows import ADVICE, read_table
 from data_pipelines.sources.rlds.location import retry
+from hma_jax.runtime.files import hash_file
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 
@@ -129,7 +130,7 @@ def hash_meta(root: Path) -> hashlib._Hash:
     for path in sorted(p for p in meta.rglob("*") if p.is_file()):
         name = path.relative_to(meta).as_posix()
         if not any(part.startswith(".") for part in name.split("/")):
-            digest.update(f"{name}:{retry(path, functools.partial(_hash_file, path))};".encode())
+            digest.update(f"{name}:{retry(path, functools.partial(hash_file, path))};".encode())
     return digest
 
 
@@ -160,13 +161,8 @@ def _hash_episodes(root: Path, meta: LeRobotMeta) -> hashlib._Hash:
     of_episodes = root / "meta" / "episodes_stats.jsonl"  # 2.1
     statistics = of_episodes if known or of_episodes.exists() else root / "meta" / "stats.json"
     if statistics.exists():
-        digest.update(retry(statistics, functools.partial(_hash_file, statistics)).encode())
+        digest.update(retry(statistics, functools.partial(hash_file, statistics)).encode())
     return digest
-
-
-def _hash_file(path: Path) -> str:
-    with path.open("rb") as file:  # in small parts: statistics of every episode can be half a gigabyte
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _episodes_2(root: Path, info: dict[str, Any], videos: list[str]) -> list[EpisodeEntry]:

@@ -6,7 +6,6 @@ against deliberate forgery, which could recompute the hashes.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from experiments.running.attempts import RESULT, RUN
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.windows import FILE as WINDOWS
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import hash_file, write_file
 
 SAMPLES = "samples.npz"
 
@@ -30,7 +29,7 @@ SPARED = (SAMPLES,)
 
 def write_result(directory: Path, result: dict[str, Any]) -> None:
     """Writes result.json, the last file of a trial, in the directory that bears its id."""
-    files = {name: _digest(directory / name) for name in SEALED if (directory / name).is_file()}
+    files = {name: hash_file(directory / name) for name in SEALED if (directory / name).is_file()}
     values = json.loads(json.dumps({**result, "trial": directory.name, "files": files}))
     write_file(directory / RESULT, json.dumps({"hash": stable_hash(values), **values}, indent=1))
 
@@ -47,7 +46,7 @@ def read_result(directory: Path) -> dict[str, Any]:
             if name in SPARED and not path.exists():
                 continue
             require(path.is_file(), f"{name} is missing")
-            require(_digest(path) == digest, f"{name} was changed, or cut off, after {RESULT} was written")
+            require(hash_file(path) == digest, f"{name} was changed, or cut off, after {RESULT} was written")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"no {error} in {RESULT}" if isinstance(error, KeyError) else error
         raise ConfigError(
@@ -55,8 +54,3 @@ def read_result(directory: Path) -> dict[str, Any]:
             "remove its directory to run it again"
         ) from error
     return values
-
-
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import secrets
@@ -38,6 +39,12 @@ def cache_directory() -> Path:
         raise ConfigError(
             f"this user has no home directory to keep files in; set {CACHE_VARIABLE} to a directory where you may write"
         ) from None
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of a file's contents, in hex digits. The file is read in small parts: it may be larger than memory."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync(path: Path) -> None:

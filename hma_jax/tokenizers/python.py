@@ -30,6 +30,7 @@ from jax.experimental.buffer_callback import Buffer, ExecutionContext, buffer_ca
 from hma_jax.config import PythonConfig, require
 from hma_jax.config.json import from_dict, identity_of
 from hma_jax.model.params import Declared, Params, declare
+from hma_jax.runtime.files import hash_file
 from hma_jax.runtime.user_code import called_from_program, naming_line
 from hma_jax.tokenizers.base import Tokenizer, fitting_piece, in_pieces
 
@@ -253,8 +254,7 @@ def hash_folder(folder: Path) -> str:
     tokenizer.py."""
     digest = hashlib.sha256()
     for name in _files(folder):
-        with (folder / name).open("rb") as file:
-            digest.update(f"{name}\n{hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
+        digest.update(f"{name}\n{hash_file(folder / name)}\n".encode())
     return digest.hexdigest()
 
 

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import hash_file, write_file
 
 NAME = "sha256.json"
 
@@ -50,7 +50,7 @@ class ReadError(OSError):
 def hash_files(checkpoint: Path, chosen: Chosen) -> list[Row]:
     """A row for each of the `chosen` files under `checkpoint`."""
     files = [(name, path) for name, path in _files(checkpoint) if chosen(name)]
-    return _in_threads(lambda file: [file[0], file[1].stat().st_size, _sha256(file[1])], files)
+    return _in_threads(lambda file: [file[0], file[1].stat().st_size, hash_file(file[1])], files)
 
 
 def write_list(checkpoint: Path, known: Iterable[Row] = ()) -> None:
@@ -104,7 +104,7 @@ def _compare(path: Path, size: int, digest: str) -> None:
         found = path.stat().st_size
         if found != size:
             raise Damaged(path, f"has {found} bytes, but {size} were written")
-        if _sha256(path) != digest:
+        if hash_file(path) != digest:
             raise Damaged(path, "its contents have changed since it was written (SHA-256 differs)")
     except (FileNotFoundError, NotADirectoryError) as error:
         raise Damaged(path, f"cannot be read ({error.strerror})") from error
@@ -123,11 +123,6 @@ def _in_threads(function: Callable[[Any], T], items: Iterable[Any]) -> list[T]:
     """`map` in threads. Raises the exception of the first item that raises one."""
     with ThreadPoolExecutor(THREADS, "hash") as threads:
         return list(threads.map(function, items))
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _hash_of(rows: Any) -> str:

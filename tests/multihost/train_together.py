@@ -59,13 +59,13 @@ def train(run_dir: Path, asked: dict[str, Any]) -> dict[str, Any]:
     model, config = model_config(action_heads=False), train_config(steps=asked["steps"], ema_decay=asked["ema"])
     mesh = MeshConfig(*asked["mesh"], min_shard_size=64)
     execution = ExecutionConfig(mesh=mesh)
-    rows, seen, hashed, sha256 = own_rows(mesh, config.batch), [], [], hashes._sha256
+    rows, seen, hashed, sha256 = own_rows(mesh, config.batch), [], [], hashes.hash_file
 
     def record(path: Path) -> str:
         hashed.append(path.as_posix())
         return sha256(path)
 
-    hashes._sha256 = record
+    hashes.hash_file = record
 
     def own(step: int) -> dict[str, np.ndarray]:
         return {name: x[rows] for name, x in random_batch(step, model, config.batch).items()}

@@ -262,8 +262,8 @@ def test_statistics_of_a_dataset_stand_for_those_that_its_episodes_lack(tmp_path
 
 def test_the_statistics_are_hashed_once_while_no_file_changes(tmp_path, monkeypatch):
     """A command opens a dataset several times, and a million episodes took minutes each time."""
-    root, hashed, own = write_lerobot(tmp_path / "toy-arm", "v3.0"), [], lerobot_meta._hash_file
-    monkeypatch.setattr(lerobot_meta, "_hash_file", lambda path: hashed.append(path) or own(path))
+    root, hashed, own = write_lerobot(tmp_path / "toy-arm", "v3.0"), [], lerobot_meta.hash_file
+    monkeypatch.setattr(lerobot_meta, "hash_file", lambda path: hashed.append(path) or own(path))
     found = set()
     for text in ("{}", "{} "):
         (root / "meta" / "stats.json").write_text(text)
