@@ -12,7 +12,7 @@ EXTRA ?=
 COMMA := ,
 GIVEN := $(subst $(COMMA), ,$(EXTRA))
 ifneq ($(EXTRA),)
-EXTRAS := $(shell sed -n '/^.project.optional/,/^\[/s/^\([a-z0-9]*\) = .*/\1/p' pyproject.toml)
+EXTRAS := $(shell sed -n '/^.project.optional/,/^\[/s/^\([a-z0-9-]*\) = .*/\1/p' pyproject.toml)
 ifneq ($(word 2,$(EXTRA))$(filter-out $(EXTRAS),$(GIVEN)),)
 $(error EXTRA is '$(EXTRA)': give any of $(EXTRAS), separated by commas without spaces, or leave it out)
 endif
