@@ -20,10 +20,10 @@ def branch(
 ) -> None:
     """Copy one checkpoint of a run into a run of its own, to go on from there with other settings.
 
-    To continue it, run `hma train --run NEW` with the arguments that RUN was trained with. --set may change the
-    optimiser, masks, seed or number of steps: a lower learning rate or another order of data after a spike of the
-    loss, or more steps from before the learning rate decayed. Checkpoints of NEW record how it was trained until
-    then. Other commands treat NEW like any run.
+    To continue it, run `hma train --run NEW` with the arguments that RUN was trained with. --set may change settings of
+    the optimiser (not matrices) and of the masks (not setting), the seed or the number of steps: a lower learning rate
+    or another order of data after a spike of the loss, or more steps from before the learning rate decayed. Checkpoints
+    of NEW record how it was trained until then. Other commands treat NEW like any run.
 
     Args:
         source: Directory of a training run.

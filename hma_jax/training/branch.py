@@ -1,8 +1,8 @@
 """A run that starts from a checkpoint of another run.
 
-A run that was branched (`branch`) may continue with another optimiser, other masks, another order of data or another
-number of steps: for example after a spike of the loss, or to extend a run from before its learning rate decayed. Its
-checkpoints record where it was branched and how it was trained until then.
+A run that was branched (`branch`) may continue with other settings of optimiser and masks, another order of data or
+another number of steps: for example after a spike of the loss, or to extend a run from before its learning rate
+decayed. Its checkpoints record where it was branched and how it was trained until then.
 
 Trials share the steps that they have in common (`begin_from`). With the schedule wsd, runs that differ only in their
 number of steps are the same until the decay of the shorter one (`optimizer.steps_in_common`). A run that continues from

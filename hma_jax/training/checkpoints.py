@@ -311,7 +311,7 @@ class Checkpoints:
         if changes:
             raise CheckpointError(
                 f"the checkpoint at {self.directory} (step {step}) was made with another configuration; use a new "
-                "output directory, go on in a branch (`hma branch`: other optimiser, masks, seed or steps), or restore "
+                "output directory, go on in a branch (`hma branch`: other learning rate, masks, seed or steps), or restore "
                 "these fields:\n  " + "\n  ".join(changes)
             )
         wanted = {name: item for name, item in shapes._asdict().items() if item is not None}
