@@ -87,7 +87,7 @@ def test_the_axis_horizon_is_as_findings_say():
     trained = {steps: trials for steps, (_, trials) in robots_at("cpu-full", "horizon").items()}
     ((_, controls),) = robots_at("cpu-full", "horizon", CONTROL).values()
     assert trained[16_000] == 3 and trained[32_000] == controls == 1
-    assert "three seeds (controls, ≥32,000 steps: one);" in readme()
+    assert "three seeds (one for controls and ≥32,000 steps);" in readme()
     assert f"PSNR, copying {copying} dB" in page
     alone = [counts(robots_at("cpu-full", "horizon", seed=seed, at=16_000)[16_000][0])[2] for seed in (0, 1, 2)]
     said = "Counted so, the single seeds of 16,000 steps have ΔPSNR beyond 2 on {}, {} and {} robots."
