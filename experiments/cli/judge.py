@@ -66,7 +66,7 @@ def judge(
             they succeeded. The head is trained on them; policies start where held-out recordings start.
         split: Split of --recordings. Default: train.
         reward: With --recordings that have a reward in every step: the goal is reached in steps with at least this
-            reward. The head is then trained frame by frame, which needs far fewer recordings.
+            reward. The head is then trained frame by frame, which gave better labels.
         registry: TOML file with your own registry entries, besides those of the study of RUN.
         real: CSV file with results of the policies on the real robot, with --recordings: columns policy, successes,
             episodes.

@@ -23,7 +23,7 @@ Weights = Literal["auto", "last", "ema"]
 keeps one (`TrainConfig.ema_decay`)."""
 
 Matrices = Literal["adamw", "muon"]
-"""Optimisers of the trunk's hidden matrices."""
+"""Optimisers of matrices from width to width, the trunk's and the robots' own."""
 
 ActionScale = Literal["deviation", "quantiles"]
 """The scale of actions: standard deviations from their mean, or the scale on which their 1 % and 99 % quantiles are -1
@@ -173,8 +173,9 @@ class OptimizerConfig:
     # embeddings.
     weight_decay: float = 0.05
     clip_norm: float = 1.0  # gradients with a larger norm are scaled down to it
-    # Optimiser of the trunk's hidden matrices: AdamW, as for all other parameters, or Muon, which orthogonalises their
-    # momentum (Jordan et al. 2024). DIFFERS: the release has only AdamW. What Muon gains: docs/models.md.
+    # Optimiser of matrices from width to width, the trunk's and the robots' own: AdamW, as for all other parameters, or
+    # Muon, which orthogonalises their momentum (Jordan et al. 2024). DIFFERS: the release has only AdamW. What Muon
+    # gains: docs/models.md.
     matrices: Matrices = later("adamw")
 
     def __post_init__(self):
