@@ -27,7 +27,6 @@ from data_pipelines.tokens.part_files import read_actions
 from data_pipelines.tokens.row_sample import ActionRange, RowSampler, quantiles_vary, sampled_episodes
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
-from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import DEAD_STD, EmbodimentTable
 
 _File = tuple[str, str, int]  # dataset, split, part
@@ -82,12 +81,10 @@ class TokenStore:
         chosen = sorted(self.names if names is None else names)
         return stable_hash({name: self.manifest(name).hash() for name in chosen})
 
-    def embodiment_table(
-        self, names: Sequence[str], rate: float | None, scale: ActionScale = "deviation"
-    ) -> EmbodimentTable:
+    def embodiment_table(self, names: Sequence[str], rate: float | None) -> EmbodimentTable:
         """The table of `names`, in that order, with statistics of all training actions. Raises what
         `Manifest.embodiment` raises."""
-        return EmbodimentTable(tuple(self.manifest(name).embodiment(rate, scale=scale) for name in names))
+        return EmbodimentTable(tuple(self.manifest(name).embodiment(rate) for name in names))
 
     def episode(self, name: str, split: str, i: int) -> StoredEpisode:
         """Episode `i` of a split, in store order. Raises DataError for a damaged record, UnreachableError if the disk

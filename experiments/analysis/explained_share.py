@@ -23,9 +23,9 @@ class ExplainedShare:
     moved: float
 
 
-def read_shares(path: Path = EXPLAINED) -> dict[str, ExplainedShare]:
+def read_shares() -> dict[str, ExplainedShare]:
     """The committed table, by robot."""
-    with path.open(newline="") as file:
+    with EXPLAINED.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return {
         r["robot"]: ExplainedShare(

@@ -70,8 +70,9 @@ def summarise(seconds: list[float]) -> Timing:
     return Timing(float(np.median(seconds)), float(np.percentile(seconds, 90)), float(np.min(seconds)), len(seconds))
 
 
-def matmul_rate(dtype: str, size: int = 2048) -> float:
+def matmul_rate(dtype: str) -> float:
     """FLOP/s of a square matrix product: what this machine can do, to compare with."""
+    size = 2048
     a = jax.random.normal(jax.random.key(0), (size, size)).astype(dtype)
     call = compile_call(lambda x: x @ x, a)
     timing = time_by_turns({"matmul": lambda: call(a)}, 10)["matmul"]

@@ -55,16 +55,16 @@ def pair(lengths: tuple[float, ...], x: float, radius: float, fingers: float) ->
     return two_arms(lengths, tip=gripper(fingers, 0.09), base=(x, -0.8), radius=radius, swing=55, bend=85, taper=0.88)
 
 
-def targets(count: int, unit: float, offset: float = 0.0) -> tuple[JointTarget]:
-    return (JointTarget("joints", joints(0, count), unit, offset),)
+def targets(unit: float, offset: float = 0.0) -> tuple[JointTarget]:
+    return (JointTarget("joints", joints(0, 8), unit, offset),)
 
 
 BIMANUAL = family("bimanual",  # two arms of three joints, each with a gripper: where each joint is to be
-    Row(SKY, 4, 200, (4, 14), pair((0.5, 0.42, 0.14), 0.55, 0.16, 0.32), targets(8, 1.0)),
-    Row(PLUM, 6, 80, (3, 14), pair((0.46, 0.44, 0.12), 0.6, 0.17, 0.34), targets(8, DEGREE), Camera(zoom=0.95)),
-    Row(ROAD, 2, 30, (8, 40), pair((0.54, 0.4, 0.14), 0.5, 0.15, 0.34), targets(8, TICK, -2048 * TICK), Camera(tilt=0.92), dict(video_only=True)),
-    Row(SAND, 10, 12, (4, 16), pair((0.52, 0.38, 0.18), 0.58, 0.16, 0.3), targets(8, 0.5), Camera(rotate=8), dict(delay=1)),
-    Row(SLATE, 20, 8, (5, 25), pair((0.48, 0.44, 0.16), 0.52, 0.17, 0.32), targets(8, 2 * math.pi), Camera(rotate=-6, zoom=1.05)),
+    Row(SKY, 4, 200, (4, 14), pair((0.5, 0.42, 0.14), 0.55, 0.16, 0.32), targets(1.0)),
+    Row(PLUM, 6, 80, (3, 14), pair((0.46, 0.44, 0.12), 0.6, 0.17, 0.34), targets(DEGREE), Camera(zoom=0.95)),
+    Row(ROAD, 2, 30, (8, 40), pair((0.54, 0.4, 0.14), 0.5, 0.15, 0.34), targets(TICK, -2048 * TICK), Camera(tilt=0.92), dict(video_only=True)),
+    Row(SAND, 10, 12, (4, 16), pair((0.52, 0.38, 0.18), 0.58, 0.16, 0.3), targets(0.5), Camera(rotate=8), dict(delay=1)),
+    Row(SLATE, 20, 8, (5, 25), pair((0.48, 0.44, 0.16), 0.52, 0.17, 0.32), targets(2 * math.pi), Camera(rotate=-6, zoom=1.05)),
     task=Carry(objects=2, size=0.23), instruction="put the puck on the mark",
     physics=Physics(inertia=0.06, friction=3.0, bounce=0.1))
 
