@@ -21,7 +21,7 @@ class DataSize:
     """The size of one dataset."""
 
     episodes: int  # damaged and held-out ones included; 0: unknown
-    tokenised: int  # of these, all but those that `StoreConfig.max_train` leaves out; an upper bound if not known
+    tokenised: int  # of these, all but those that the setting `max_train` leaves out; an upper bound if not known
     trained: int | None = None  # trajectories to train on; None: it is unknown how many are held out
     skipped: int = 0  # trajectories to train on or held out that are left out as damaged
     mean_steps: float = 0.0  # native frames per episode, as the files say; 0: they do not say

@@ -29,7 +29,7 @@ from hma_jax.config import (
     check_objective,
     require,
 )
-from hma_jax.config.base import later, require_seed
+from hma_jax.config.base import require_seed
 
 SCALING = ("datasets", "trajectories", "width")
 """The demonstration: the axes that `hma study` runs, unless its preset says otherwise."""
@@ -54,17 +54,9 @@ class SuiteConfig:
 
 
 @dataclass(frozen=True)
-class StoreConfig:
+class StoreConfig(HeldOut):
     """What the token store keeps (`data_pipelines.tokens.tokenize_job`)."""
 
-    val_fraction: float = HeldOut.val_fraction  # fraction of episodes that are held out
-    min_val: int = HeldOut.min_val  # smallest number of held-out episodes per dataset
-    max_val: int = HeldOut.max_val  # largest number of held-out episodes per dataset
-    # Largest fraction of a dataset that is held out; takes precedence over min_val.
-    max_val_fraction: float = HeldOut.max_val_fraction
-    # Largest number of training episodes per dataset, chosen by hash as by --trajectories; others are not tokenised.
-    # If it is set, at most max_val episodes are tokenised of a split that an entry holds out. null: all episodes.
-    max_train: int | None = later(None)
     frame_step: int | None = None  # store every N-th native frame; 1: all; null: those of the study's rate
     corrupt: Literal["raise", "skip"] = "raise"  # at a damaged record, stop with an error, or leave it out and count it
     max_skipped: float = 16.0  # largest number of damaged episodes per dataset to leave out; below 1: a fraction
@@ -76,15 +68,11 @@ class StoreConfig:
             f"store.max_skipped must be a whole number of episodes or, below 1, a fraction of them, got {m:g}",
         )
         # Checked here as tokenising checks them, which may come hours later.
-        self.held_out.check("store.")
+        self.check("store.")
         require(
             self.frame_step is None or self.frame_step >= 1,
             f"store.frame_step must be at least 1, got {self.frame_step}",
         )
-
-    @property
-    def held_out(self) -> HeldOut:
-        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction, self.max_train)
 
 
 @dataclass(frozen=True)

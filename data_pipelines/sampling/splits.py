@@ -22,15 +22,22 @@ from hma_jax.config.base import later
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How many episodes of a dataset are held out, and how many at most are trained on. The fields have the names of
-    the settings of studies and token stores."""
+    """How many episodes of a dataset are held out, and how many at most are trained on. Studies and token stores have
+    these settings, and others besides."""
 
-    val_fraction: float = 0.05  # of all episodes
-    min_val: int = 2
-    max_val: int = 200
-    max_val_fraction: float = 0.25  # takes precedence over min_val
-    # Largest number of episodes to train on; None: all. If set, max_val also bounds a split that the entry holds out.
+    val_fraction: float = 0.05  # fraction of episodes that are held out
+    min_val: int = 2  # smallest number of held-out episodes per dataset
+    max_val: int = 200  # largest number of held-out episodes per dataset
+    # Largest fraction of a dataset that is held out; takes precedence over min_val.
+    max_val_fraction: float = 0.25
+    # Largest number of training episodes per dataset, chosen by hash as by --trajectories; others are not tokenised.
+    # If it is set, at most max_val episodes are tokenised of a split that an entry holds out. null: all episodes.
     max_train: int | None = later(None)
+
+    @property
+    def held_out(self) -> HeldOut:
+        """These settings alone, of a class that has more."""
+        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction, self.max_train)
 
     def count(self, episodes: int) -> int:
         """`val_fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_val_fraction`.

@@ -124,7 +124,13 @@ def _plan(
     return Manifest(
         spec=spec,
         tokenizer=facts[0],
-        settings=JobSettings(0.0, 0, 0, "none" if tokenizer is None else "val", frame_step),
+        settings=JobSettings(
+            val_fraction=0.0,
+            min_val=0,
+            max_val=0,
+            keep_frames="none" if tokenizer is None else "val",
+            frame_step=frame_step,
+        ),
         source=_fingerprint(folders),
         source_version="release" if tokenizer is None else "release, frames decoded",
         action_mean=(),

@@ -60,28 +60,21 @@ class TokenizerFacts:
 
 
 @dataclass(frozen=True)
-class JobSettings:
-    """The settings of a tokenising job. Equal settings on equal input give equal stores."""
+class JobSettings(HeldOut):
+    """The settings of a tokenising job. Equal settings on equal input give equal stores; `max_train` is set only if it
+    leaves episodes out."""
 
-    val_fraction: float = HeldOut.val_fraction
-    min_val: int = HeldOut.min_val
-    max_val: int = HeldOut.max_val
+    max_val_fraction: float = later(0.5)  # new stores use the value of `HeldOut`
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
-    max_val_fraction: float = later(0.5)  # limits min_val too; new stores use the value of `HeldOut`
-    max_train: int | None = later(None)  # set only if it leaves episodes out
 
     def __post_init__(self):
-        self.held_out.check()
+        self.check()
         require(self.frame_step >= 1, f"frame_step must be at least 1, got {self.frame_step}")
         require(
             self.keep_frames in ("none", "val", "all"),
             f"keep_frames must be none, val or all, got {self.keep_frames!r}",
         )
-
-    @property
-    def held_out(self) -> HeldOut:
-        return HeldOut(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction, self.max_train)
 
 
 @dataclass(frozen=True)
@@ -161,7 +154,7 @@ class Manifest:
 
     @property
     def left_out(self) -> int:
-        """Number of episodes of the source that `settings.max_train` leaves out."""
+        """Number of episodes of the source that the setting `max_train` leaves out."""
         return sum(self.episodes_of_parts) - len(self.train.episodes) - len(self.val.episodes) - self.skipped_count
 
     @property

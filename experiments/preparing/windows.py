@@ -161,7 +161,7 @@ def _differences(existing: EvalManifest, wanted: EvalManifest) -> list[str]:
 
 def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float | None) -> dict[str, dict[str, int]]:
     """Per dataset: numbers of training episodes, of those too short for a window or for a whole window, of windows, of
-    episodes held out and skipped, and of those that `StoreConfig.max_train` left out, if any."""
+    episodes held out and skipped, and of those that the setting `max_train` left out, if any."""
     from data_pipelines.windows.windows import train_windows
 
     summary = {}

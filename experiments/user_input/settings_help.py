@@ -49,8 +49,10 @@ def describe_settings(config: Any, prefix: str = "") -> Iterator[SettingHelp]:
 
 def comments(config: type) -> dict[str, str]:
     """The first sentence of each field's comment, which is behind the field or in the lines above."""
+    inherited = (comments(base) for base in config.__bases__ if is_dataclass(base))
+    found = {name: text for base in inherited for name, text in base.items()}
     source = textwrap.dedent(inspect.getsource(config))
-    lines, found = source.splitlines(), {}
+    lines = source.splitlines()
     (declared,) = ast.parse(source).body
     for node in declared.body:
         if not isinstance(node, ast.AnnAssign):
