@@ -69,7 +69,7 @@ def run_study(
     study, workspace = setup.study, setup.workspace
     if not setup.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
-    sweeps = plan_asked(study, axes, workspace.root)
+    sweeps = plan_asked(study, axes)
     sources = trial_closure()  # trials refuse to run if the sources change later
     require_trainable(study, sweeps, launcher_options)
     say_notes(setup, sweeps, launcher_options)
@@ -83,7 +83,7 @@ def run_study(
         provenance = prepare_apart(setup, replace)
         if setup.data:
             study = _count_again(setup, sweeps)
-            sweeps, planned = plan_asked(study, axes, workspace.root), plan_sweeps(study, tuple(every.values()))
+            sweeps, planned = plan_asked(study, axes), plan_sweeps(study, tuple(every.values()))
         require_judged(study, workspace, all_judged(sweeps))
         if earlier and (changes := diff(earlier.provenance, provenance)):
             say(f"note: changed since the last run here: {'; '.join(changes)}. The trials that depend on it run again")

@@ -44,7 +44,7 @@ class Row:
 
     It is a mean over `n` windows of `episodes` episodes, over which the error is taken (the training loss: over `n`
     steps, `episodes` 0). A trial without a result has one row per sweep, with `metric` empty. Fields with a default are
-    missing in tables of earlier versions.
+    missing in some committed tables.
     """
 
     sweep: str
@@ -126,7 +126,7 @@ def _rows(
 
 
 def training_loss(result: dict[str, Any]) -> Stat:
-    """The mean of a run's last steps. Results of earlier versions hold the loss of every step instead."""
+    """The mean of a run's last steps. Some committed results hold the loss of every step instead."""
     return Stat(**(result.get("training_loss") or last_loss(result["losses"])))
 
 
@@ -142,8 +142,8 @@ def write_rows(workspace: Workspace, rows: Iterable[Row]) -> None:
 
 
 def read_rows(workspace: Workspace) -> list[Row]:
-    """Reads what `write_rows` wrote; earlier versions wrote everything into results.csv. Raises ConfigError for a
-    damaged table."""
+    """Reads what `write_rows` wrote; some committed tables have everything in results.csv. Raises ConfigError for a
+    damaged one."""
     import pyarrow as pa
 
     rows = read_csv(workspace.results)
@@ -165,7 +165,7 @@ def place_rows(rows: Iterable[Row], sweeps: Sequence[Sweep]) -> tuple[list[Row],
     placed, gone = [], dict[str, None]()
     for r in rows:
         names = places.get(r.sweep)
-        if not names or not r.label:  # an axis of numbers, or a version that did not write the name
+        if not names or not r.label:  # an axis of numbers, or a table without names
             placed.append(r)
         elif r.label in names:
             placed.append(r if r.x == names[r.label] else dataclasses.replace(r, x=names[r.label]))
@@ -189,7 +189,7 @@ def csv_text(kind: type, rows: Iterable[Any]) -> str:
 
 
 def read_csv(path: Path) -> list[Row]:
-    """The rows of a table that this or an earlier version wrote. Raises ConfigError for a damaged one."""
+    """The rows of a table. Raises ConfigError for a damaged one."""
     kinds = {"x": _number, "seed": int, "n": int, "episodes": int, "parameters": int, "results": int}
     kinds |= {"mean": float, "sem": float, "train_flops": float}
     rows = []
@@ -231,7 +231,7 @@ class CurvePoint:
     seeds: dict[int, float]  # the mean of each seed
     parameters: tuple[int, ...]  # the numbers that its seeds have, in order: several if robots are drawn
     label: str = ""
-    clustered: bool = True  # by episode, as errors of each seed are; in tables of earlier versions windows stand alone
+    clustered: bool = True  # by episode, as errors of each seed are; in some committed tables windows stand alone
 
 
 def curve(

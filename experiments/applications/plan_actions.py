@@ -128,21 +128,10 @@ def expert_end(task: Task, seed: int, stride: int) -> Environment:
     spec = noisy(task, 0.0)
     world, seen = World(spec, [seed]), Environment(spec)
     expert = make_expert(world, 0)
-    for _ in range(count_expert_actions(task, stride)):
+    for _ in range(2 * task.frames * stride):
         world.step(expert.act().astype(np.float64))
     seen.set_state(world.state)
     return seen
-
-
-def count_expert_actions(task: Task, stride: int) -> int:
-    """The number of expert actions. `stride`: actions per frame."""
-    return 2 * task.frames * stride
-
-
-def besides_settings(task: Task, stride: int) -> dict[str, int]:
-    """How many actions the expert has if a frame has several: in earlier versions it had fewer, so their goals were
-    different."""
-    return {"expert_actions": count_expert_actions(task, stride)} if stride > 1 else {}
 
 
 def run_planner(way: str, simulator: Simulator, robot: Robot, settings: Settings, seed: int) -> dict:
@@ -207,7 +196,7 @@ def compare(run: Path, out: Path, settings: Settings, wanted: Collection[str]) -
     simulator = load_simulator(run, episodes=settings.search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = settings.start_seeds()
-    pin_settings(out, run, simulator, settings, besides_settings(settings.make_task(), robot.stride))
+    pin_settings(out, run, simulator, settings)
     paths = {way: outcome_paths(out, way, settings.starts) for way in WAYS}
     tried = [way for way in WAYS if way in wanted or all(path.exists() for path in paths[way])]
     trials: dict[str, list[dict]] = {way: [] for way in tried}

@@ -47,27 +47,20 @@ def pin_settings(
     before.
 
     Fields named in `may_differ` (how many results there are) and in `unused` (what no result depends on), and those
-    under them, may differ. Raises ConfigError, naming the differences, if another field differs, and for a file of an
-    earlier version that does not say how frames are filled.
+    under them, may differ. Raises ConfigError, naming the differences, if another field differs.
     """
     path, wanted = out / file, described(run, simulator, *settings)
     if path.exists():
         known = read_json(path, "copy it again from where it was made, or choose another --out")
         for part in ({SIMULATOR: {"decode": simulator.decode}}, *settings):
             known = completed(known, part)
-        comparable = wanted if SIMULATOR in known else {name: x for name, x in wanted.items() if name != SIMULATOR}
         unused = unused if simulator.tokenizer.channels else (*unused, SAMPLER)
         free = tuple(f"{name}{end}" for name in (*may_differ, *unused) for end in ":.")
-        differences = [line for line in diff(known, comparable) if not line.startswith(free)]
+        differences = [line for line in diff(known, wanted) if not line.startswith(free)]
         require(
             not differences,
             f"{out} holds results made with other settings ({'; '.join(differences)}); choose another --out or remove "
             "it",
-        )
-        require(
-            SIMULATOR in known,
-            f"{path} does not contain the decoding of frames and the robots' action ranges: choose another --out, or, "
-            "if you know that neither has changed, remove this file",
         )
     else:
         write_settings(out, run, simulator, *settings, file=file)

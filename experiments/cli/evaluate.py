@@ -13,7 +13,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from experiments.cli.arguments import StudyOptions
 from experiments.cli.hosts import Hosts
-from experiments.preparing.evaluation_stamp import STAMP, describe_evaluation, require_same_evaluation
+from experiments.preparing.evaluation_stamp import STAMP, UNFINISHED, describe_evaluation, require_same_evaluation
 from experiments.running.attempts import EVALUATING, JOB
 from experiments.running.provenance import closure_hash, trial_closure
 from experiments.running.result_file import SAMPLES
@@ -94,7 +94,7 @@ def _evaluate(setup: StudySetup, run: Path, trained: Run, place: Path, replace: 
     execution, protocol = setup.study.execution, setup.study.eval
     made_from = describe_evaluation(trained, names, prepared, protocol)
     if not replace:
-        require_same_evaluation(place, made_from, trained)
+        require_same_evaluation(place, made_from)
     # More than the stamp holds: the batch size decides which windows share a batch, and a run that was trained again
     # may have other weights at the same step.
     weights = read_list(run / CHECKPOINTS / str(trained.step))
@@ -130,24 +130,27 @@ def write_results(place: Path, evaluation: Evaluation, made_from: MadeFrom) -> N
     OSError is raised, and they are kept, if that fails."""
     from experiments.running.run_trial import write_evaluation
 
-    made = place / ".evaluation.tmp"
+    made, moving = place / UNFINISHED, False
     try:
         shutil.rmtree(made, ignore_errors=True)  # a killed process left it
         made.mkdir()
         write_evaluation(made, evaluation, place.name)
         write_file(made / MEANS, to_strict_json(evaluation.summary.to_dict()))
         made_from.save(made, STAMP)
+        moving = True
         for name in (STAMP, MEANS, SAMPLES):  # if killed here, no file may be left beside files of another evaluation
             (place / name).unlink(missing_ok=True)
         for name in (FILE, SAMPLES, MEANS, STAMP):
             if (made / name).exists():
                 os.replace(made / name, place / name)
         sync(place)
+        moving = False
     except OSError as error:
         error.filename = str(place)  # the only path that the user knows
         raise
     finally:
-        shutil.rmtree(made, ignore_errors=True)
+        if not moving:  # otherwise what is left there says of what the files in `place` are
+            shutil.rmtree(made, ignore_errors=True)
 
 
 def _choose_datasets(setup: StudySetup, trained: Run, prepared: PreparedData) -> tuple[str, ...]:

@@ -118,7 +118,7 @@ def _dry_run(
     from experiments.running.provenance import trial_closure
 
     study, given = setup.study, bool(setup.data)
-    sweeps = plan_asked(study, axes, setup.workspace.root)
+    sweeps = plan_asked(study, axes)
     if given:
         check_entries(study, setup.data)
     each = check_launched(study, sweeps, launcher_options)

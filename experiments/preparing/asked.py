@@ -80,8 +80,6 @@ def require_same_asked(
 
 
 def _require_same(there: Asked, here: Asked, busy: Busy) -> None:
-    if ENTRIES not in there:
-        raise Busy(f"{busy}. The work cannot be shared, since that one is of an earlier version", busy.holder)
     both = there[ENTRIES].keys() & here[ENTRIES].keys()  # `datasets` shows the others
     if lines := diff(_of(both, there), _of(both, here)):
         raise Busy(

@@ -212,7 +212,7 @@ def _say_what_it_may_know(training: MadeFrom, study: Study, sources: Sequence[So
         for spec, path in known
         if spec.name not in otherwise
         and (made_of := data[spec.name].get("shards"))
-        and made_of != open_source((spec, path), study.store).fingerprint_as(made_of)
+        and made_of != open_source((spec, path), study.store).fingerprint()
     ]
     if changed:
         say(

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -33,12 +33,6 @@ IN_WORDS: dict[Step, str] = {
 }
 
 STAMP = "made_from.json"
-OLD_STAMP = "made_from.txt"
-"""The stamp of earlier versions: a hash, which does not show what differs."""
-
-FORMERLY_RECORDED = ("tau", "order")
-"""Inputs that are only recorded in stamps of earlier versions."""
-
 ORIGIN = "origin"
 """The input that decides which others there are."""
 
@@ -70,9 +64,7 @@ def read_stamp(directory: Path, name: str = STAMP) -> MadeFrom | None:
         require(all(isinstance(part, dict) for part in vars(existing).values()), "not JSON values by name")
     except (OSError, ValueError):  # ConfigError is a ValueError
         return None
-    moved = {name: existing.recorded[name] for name in FORMERLY_RECORDED if name in existing.recorded}
-    recorded = {name: value for name, value in existing.recorded.items() if name not in moved}
-    return replace(existing, inputs=moved | existing.inputs, recorded=recorded)
+    return existing
 
 
 def differences(existing: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:

@@ -97,14 +97,13 @@ def say_other_rates(study: Study, sources: Sequence[Source]) -> None:
 
 def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:
     """How the datasets in the store were made differently; a line that holds for several datasets is given once."""
-    from data_pipelines.tokens.dataset_writer import differences, recorded_source
+    from data_pipelines.tokens.dataset_writer import differences
     from data_pipelines.tokens.tokenize_job import plan_dataset
 
     s = study.store
     plans = {
         spec.name: plan_dataset(
             spec, open_source((spec, path), s), tokenizer, s.held_out, frame_step=s.frame_step, rate=study.rate,
-            recorded=recorded_source(workspace.store, spec.name),
         )
         for spec, path in sources
         if (workspace.store / spec.name).exists()
@@ -139,7 +138,7 @@ def _joined_lines(names: Iterable[str], differences: Callable[[str], list[str]])
             lines = differences(name)
         except UnreachableError:  # it may be intact
             raise
-        except DataError as error:  # damaged, or of an older format
+        except DataError as error:  # damaged, or of another format
             lines = [str(error)]
         for line in lines:
             if line.startswith("settings."):

@@ -16,7 +16,6 @@ from data_pipelines.publishing.files import publish
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.sampling.order import ORDER_VERSION
 from experiments.preparing.made_from import (
-    OLD_STAMP,
     ORIGIN,
     MadeFrom,
     Step,
@@ -58,14 +57,9 @@ functions count too: readers are imported when a dataset needs them."""
 TRAINED = "trained here"
 """The origin of a tokenizer that was not given."""
 
-FRAMES, ENCODED, SHRUNK = "frames", "those that are encoded", "JPEG images of RLDS shrunk while they were decoded"
-"""Recorded: the frames on which a tokenizer was trained and judged. Earlier versions, which did not record this, let
-the decoder shrink frames if it could, with a filter other than that of the frames that are encoded."""
-
 
 def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[Source]) -> MadeFrom:
-    """What the tokenizer of a study is trained from, under the names that --set uses. Recordings are named as in the
-    stamp of the existing tokenizer, which may be of an earlier version.
+    """What the tokenizer of a study is trained from, under the names that --set uses.
 
     Steps, batch and objective of the model are not part of it; the mixture's temperature is, and what the registry says
     about where a dataset's frames are.
@@ -75,7 +69,7 @@ def tokenizer_made_from(study: Study, workspace: Workspace, sources: Sequence[So
         **training_settings(study),
         **frames_made_from(study, sources, read_stamp(workspace.tokenizer)),
     }
-    recorded = {"code": closure_hash(trace(SOURCES)), FRAMES: ENCODED}
+    recorded = {"code": closure_hash(trace(SOURCES))}
     return MadeFrom(inputs, recorded, describe_machine())
 
 
@@ -87,13 +81,14 @@ def training_settings(study: Study) -> dict[str, Any]:
 def frames_made_from(
     study: Study, sources: Sequence[Source] | Sequence[Unopened], existing: MadeFrom | None
 ) -> dict[str, Any]:
-    """Inputs of a stamp that say which frames a tokenizer is trained on and judged by. Recordings are named as in an
-    `existing` stamp, which may be of an earlier version; those that are not opened are assumed to be the same."""
+    """Inputs of a stamp that say which frames a tokenizer is trained on and judged by. Recordings that are not opened
+    are assumed to be those of the `existing` stamp."""
     settings, known = study.store, existing.inputs.get("data", {}) if existing else {}
 
     def shards(spec: DatasetSpec, path: Location | Parts | None) -> str:
-        there = known.get(spec.name, {}).get("shards", "")
-        return there if path is None else open_source((spec, path), settings).fingerprint_as(there)
+        if path is None:
+            return known.get(spec.name, {}).get("shards", "")
+        return open_source((spec, path), settings).fingerprint()
 
     data = {
         spec.name: {
@@ -215,14 +210,14 @@ def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
     require_same("tokenizer", place, lines, replace, unchanged(place))
     if existing is None or lines:
         return False
-    say_recorded("the tokenizer", place, {FRAMES: SHRUNK} | existing.recorded, made_from.recorded)
+    say_recorded("the tokenizer", place, existing.recorded, made_from.recorded)
     console.print("[green]done[/] train the tokenizer [dim](before)[/]")
     return True
 
 
 def _made_otherwise(place: Path, existing: MadeFrom | None, inputs: Mapping[str, Any]) -> list[str]:
     if existing is None:
-        return ["it is not recorded there" + (", as of earlier versions" if (place / OLD_STAMP).exists() else "")]
+        return ["it is not recorded there"]
     return differences(existing.inputs, inputs)
 
 

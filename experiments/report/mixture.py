@@ -31,8 +31,8 @@ class PointData:
 
 
 def describe_mixture(trial: Trial, result: Mapping[str, Any]) -> str:
-    """A line per dataset on the amount of data and how often it was drawn; '' for one dataset, and for results of
-    earlier versions, which do not record it."""
+    """A line per dataset on the amount of data and how often it was drawn; '' for one dataset, and for results
+    that do not record it."""
     draws = trial.train.steps * trial.train.batch
     drawn = {name: Drawn(result["trajectories"][name], **one) for name, one in result.get("mixture", {}).items()}
     if len(drawn) < 2:

@@ -168,7 +168,7 @@ def _headline(
             card("ΔPSNR, shuffled actions", _at_default(rows, shown.sweep, "delta_psnr", CONTROL),
                  f"dB; a control: should be zero within {EACH:g} standard errors"),
         ]  # fmt: skip
-    if quality := _tokenizer_quality(workspace):  # earlier versions did not judge a tokenizer that was given
+    if quality := _tokenizer_quality(workspace):
         cards.append(card("tokenizer PSNR", quality, "dB, reconstruction of held-out frames"))
     unfinished = sum(state.event != FINISHED for state in states.values())
     lacking = f"{counted(unfinished, 'trial')} {'has' if unfinished == 1 else 'have'} no result"
@@ -340,7 +340,7 @@ def _processor(machine: Mapping[str, Any]) -> str:
 
 
 def _repeatable(command: str) -> str:
-    """A command without the options meant for one run only: earlier versions recorded it as it was typed."""
+    """A command without the options meant for one run only; some committed studies recorded them."""
     kept, words = [], iter(shlex.split(command))
     for word in words:
         flag, _, value = word.partition("=")

@@ -1,4 +1,4 @@
-"""job.json, the description from which a process runs one trial, as written today and by earlier versions."""
+"""job.json, the description from which a process runs one trial."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running.attempts import JOB
-from experiments.running.migration import migrate
-from experiments.running.provenance import Provenance, inputs_of
+from experiments.running.provenance import Provenance
 from experiments.running.shared_runs import SharedTraining
 from experiments.running.trial import Trial
 from hma_jax.config import ConfigError, ExecutionConfig
@@ -17,25 +16,20 @@ from hma_jax.config.json import from_dict
 
 def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, SharedTraining]:
     """(the trial, how it is computed, what it shares with others). Fields that were added after the job was written
-    take their defaults.
-
-    In earlier versions, how a trial is computed was part of the trial itself. Raises ConfigError for a record that is
-    not a job.
-    """
+    take their defaults. Raises ConfigError for a record that is not a job."""
     try:
-        trial, former_execution = migrate(record["trial"])
-        execution = record.get("execution") or {"mesh": record["mesh"]}
+        trial, execution = record["trial"], record["execution"]
     except (KeyError, TypeError) as error:
         raise ConfigError(f"job.json: not a job of this project ({error!r}); run its study again") from error
     shared = from_dict(SharedTraining, record.get("shared", {}))
-    return from_dict(Trial, trial), from_dict(ExecutionConfig, execution | former_execution), shared
+    return from_dict(Trial, trial), from_dict(ExecutionConfig, execution), shared
 
 
 def trial_in(directory: Path) -> tuple[Trial, Provenance]:
     """A finished trial and what it depends on, from its job.json. Raises ConfigError if that cannot be read."""
     try:
         job = json.loads((directory / JOB).read_text())
-        return read_job(job)[0], inputs_of(job["provenance"])
+        return read_job(job)[0], from_dict(Provenance, job["provenance"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{directory}: the description of the finished trial cannot be read ({error}); copy the trial again from "

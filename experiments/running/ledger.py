@@ -30,9 +30,6 @@ REFUSED = "refused"
 MISSING = "missing"
 """The state of a trial without a line: it has not run."""
 
-FORMER = {"started": RUNNING, "interrupted": PREEMPTED}
-"""Events as earlier versions wrote them."""
-
 
 class Ledger:
     """The ledger at `path`; created with its first line. `clock` returns seconds since 1970."""
@@ -63,10 +60,7 @@ class Ledger:
 
         The ledger cannot know whether a RUNNING trial still runs: see `attempts.read_states`.
         """
-        last = {record["trial"]: dict(record) for record in self.records()}
-        for record in last.values():
-            record["event"] = FORMER.get(record["event"], record["event"])
-        return last
+        return {record["trial"]: record for record in self.records()}
 
     def append(self, trial: str, event: str, **details: Any) -> None:
         """Adds one line and waits until it is on disk. A `message` names files as seen from the study's directory."""

@@ -11,7 +11,6 @@ no change of the code in the middle of a sweep goes unnoticed.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -38,7 +37,7 @@ class Provenance:
     store: str  # of the token store
     manifest: str  # of the frozen evaluation windows
     tokenizer: str
-    results: int = RESULTS_VERSION  # 0 for records of earlier versions, which knew no such number
+    results: int = RESULTS_VERSION  # 0: from before they were numbered
 
 
 class CodeChanged(ConfigError):
@@ -146,13 +145,6 @@ def read_record(directory: Path) -> TrialRecord | None:
         return None
     except ValueError as error:  # ConfigError is one
         raise ConfigError(f"{path}: not a record of a trial ({error}); remove {directory} to run it again") from error
-
-
-def inputs_of(values: Mapping[str, Any]) -> Provenance:
-    """The inputs as written today, or by earlier versions, which included a hash of all sources."""
-    if "code" in values:
-        values = {name: value for name, value in values.items() if name != "code"} | {"results": 0}
-    return from_dict(Provenance, dict(values))
 
 
 def _save(directory: Path, record: TrialRecord) -> None:

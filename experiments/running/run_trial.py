@@ -27,7 +27,7 @@ from experiments.running.run_options import UNWATCHED, RunOptions
 from experiments.running.trial import Trial, loader_of
 from experiments.running.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, MaskingSetting, ModelConfig
-from hma_jax.config.json import from_dict, to_dict
+from hma_jax.config.json import identity_of, to_dict
 from hma_jax.evaluation.windows import FILE
 from hma_jax.training.run_lock import CHECKPOINTS
 
@@ -117,7 +117,7 @@ def train_trial(
     `initial` parameters and an `origin`, which its checkpoints remember.
     """
     from data_pipelines.loading.loader import describe_batch, make_loader
-    from data_pipelines.loading.selection import LoaderConfig, training_table
+    from data_pipelines.loading.selection import training_table
     from hma_jax.runtime.rows import own_rows
     from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
@@ -127,10 +127,6 @@ def train_trial(
     table = table or training_table(store, loader, trial.train.action_scale)
     checkpoint_every, validate_every = options.steps_between(trial.train.steps)
     lost = {"lost": {name: store.manifest(name).skipped_count for name in trial.datasets}}  # damaged episodes, left out
-
-    def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
-        before = {"order": 1} | provenance["loader"]  # records of versions that did not say their order of draws
-        return lost | provenance | {"loader": to_dict(from_dict(LoaderConfig, before))}
 
     def report(step: int, steps: int, values: dict[str, float]) -> None:
         held_out = f", held-out loss {values['validation/loss']:.4f}" if "validation/loss" in values else ""
@@ -153,11 +149,10 @@ def train_trial(
         provenance={
             "store": store.hash(trial.datasets),
             "tokenizer": prepared.tokenizer.identity,
-            "loader": to_dict(loader),
+            "loader": identity_of(loader),
             **lost,
             **({"origin": origin} if origin else {}),
         },
-        modernise_provenance=modernise,
         initial=initial,
         records=lambda index: describe_batch(store, table, loader, index),
         options=LoopOptions(

@@ -74,11 +74,12 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from data_pipelines.errors import DataError, UnreachableError
     from experiments.running.initial_model import initial_from_trial
     from experiments.running.job import read_job
-    from experiments.running.provenance import InputsChanged, inputs_of, record_start
+    from experiments.running.provenance import InputsChanged, Provenance, record_start
     from experiments.running.run_trial import run_trial
     from experiments.running.shared_runs import begin_shared
     from experiments.running.trial import trial_id
     from experiments.running.workspace import Workspace
+    from hma_jax.config.json import from_dict
     from hma_jax.training.divergence import DivergedError
     from hma_jax.training.loop import Interrupted
 
@@ -86,7 +87,7 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     try:
         with raising_as_called():
             require_accelerator()
-            (trial, execution, shared), inputs = read_job(job), inputs_of(job["provenance"])
+            (trial, execution, shared), inputs = read_job(job), from_dict(Provenance, job["provenance"])
             record_start(directory, inputs, closure)
             if branched_from := begin_shared(directory, shared.before):
                 print(f"goes on from step {branched_from[1]} of trial {branched_from[0]}", flush=True)

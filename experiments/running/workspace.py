@@ -11,8 +11,7 @@ from pathlib import Path
 
 from data_pipelines.registry import register
 from experiments.data_size import sizes_by_tokens, use_sizes
-from experiments.running.migration import migrate
-from experiments.running.provenance import Provenance, inputs_of
+from experiments.running.provenance import Provenance
 from experiments.study import Study
 from experiments.terminal.program import PROGRAM
 from experiments.terminal.words import few
@@ -167,9 +166,6 @@ def find_record(workspace: Workspace) -> Record | None:
     path = workspace.record
     try:
         values = json.loads(path.read_text())
-        study, execution = migrate(values["study"])
-        values["study"] = study | {"execution": study.get("execution", {}) | execution}
-        values["provenance"] = to_dict(inputs_of(values["provenance"]))
         return from_dict(Record, values)
     except (FileNotFoundError, NotADirectoryError):
         return None

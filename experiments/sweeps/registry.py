@@ -78,10 +78,9 @@ def find_axis(axis: str, root: Path = Path()) -> Plan:
     return importlib.import_module(f"experiments.sweeps.{axis}").plan
 
 
-def plan_asked(study: Study, axes: Sequence[str], root: Path) -> list[Sweep]:
-    """The sweeps along `axes` that are asked for now, of a study in `root`. Raises ConfigError as `plan_sweeps` does,
-    for a file that plans different trials each time, and for a new file without a point at its reference. (A file that
-    a study keeps may lack that point, since earlier versions accepted it.)"""
+def plan_asked(study: Study, axes: Sequence[str]) -> list[Sweep]:
+    """The sweeps along `axes` that are asked for now. Raises ConfigError as `plan_sweeps` does, for a file that plans
+    different trials each time, and for a file without a point at its reference."""
     sweeps = plan_sweeps(study, axes)
     for axis, sweep in zip(axes, sweeps, strict=True):
         require(
@@ -90,9 +89,8 @@ def plan_asked(study: Study, axes: Sequence[str], root: Path) -> list[Sweep]:
             "the study continues; give random numbers a fixed seed",
         )
         values = tuple(dict.fromkeys(p.x for p in sweep.points if p.role != CONTROL))
-        kept = is_file(axis) and Path(axis).resolve().parent == (root / KEPT).resolve()
         require(
-            kept or sweep.reference_x is None or sweep.reference_x in values,
+            sweep.reference_x is None or sweep.reference_x in values,
             f"{axis}: reference_x {sweep.reference_x} is not among the values {values}, so its control would have no trial "
             "beside it; add it",
         )

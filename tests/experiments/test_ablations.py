@@ -136,7 +136,7 @@ def test_a_table_is_read_by_names_after_the_axis_got_another_variant(drawn, monk
     assert gone == ["cross_attention (axis conditioning)"]
     assert {repr(row) for row in placed} == {repr(row) for row in rows_of(drawn, now)}
     assert place_rows(placed, then)[1] == []
-    nameless = [replace(row, label="") for row in placed]  # of an earlier version
+    nameless = [replace(row, label="") for row in placed]  # as of results/ablations
     assert place_rows(nameless, then) == (nameless, [])
 
 

@@ -45,12 +45,6 @@ def test_a_full_disk_is_said_of_the_ledger(ledger):
         ledger.append("a", "running")
 
 
-def test_lines_of_earlier_versions_are_read_in_todays_words(ledger):
-    ledger.append("a", "started")
-    ledger.append("b", "interrupted")
-    assert [record["event"] for record in ledger.states().values()] == ["running", "preempted"]
-
-
 @pytest.mark.parametrize("torn", ['{"trial": "b", "ev', "{", '{"time": 1, "trial": "b", "event": "failed"}'])
 def test_torn_last_line_is_dropped_and_cut(ledger, torn):
     ledger.append("a", "finished")

@@ -256,7 +256,7 @@ TAMPERING = {
         "cannot be read",
     ),
     "cut off": (lambda d: (d / "result.json").write_text((d / "result.json").read_text()[:300]), "is damaged"),
-    "of an earlier version": (lambda d: edit(d / "result.json", '"hash"', '"hush"'), "no 'hash' in result.json"),
+    "without a hash": (lambda d: edit(d / "result.json", '"hash"', '"hush"'), "no 'hash' in result.json"),
 }
 
 
@@ -346,7 +346,7 @@ def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, 
         assert not ran and "hma study" in find_record(workspace).command
 
 
-# --- Records of earlier versions ------------------------------------------------------------------
+# --- Results that are kept -------------------------------------------------------------------------
 
 KEPT = Path(experiments.__file__).parent / "results"
 

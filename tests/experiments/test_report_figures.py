@@ -180,7 +180,7 @@ def test_a_loss_whose_exp_no_float_holds_is_left_out_of_figures_which_say_so(pla
 
 
 def test_errors_of_tables_without_episodes_are_said_to_be_over_windows():
-    """Earlier versions counted none."""
+    """As that of results/ablations."""
     sweep = plan_conditioning(CPU_FULL)
     rows = [replace(r, episodes=0) for r in rows_of(sweep, lambda _: {"cross_entropy": 4.0})]
     assert "bars: s.e. over seeds and windows;" in plot_names(rows, sweep).get_supxlabel()

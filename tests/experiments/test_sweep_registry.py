@@ -2,7 +2,6 @@
 
 import json
 import re
-import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +11,8 @@ import experiments.sweeps
 from experiments.cli.main import main
 from experiments.presets import CPU_FULL
 from experiments.report.draw import draw
-from experiments.run_study import whole_command
 from experiments.running.trial import Trial
 from experiments.running.workspace import Workspace, load_record, save_record
-from experiments.study_setup import StudyArguments, make_setup
 from experiments.sweeps.registry import AXES, find_axis, join_axes, keep_axes, plan_sweeps
 from experiments.sweeps.sweep import CONTROL, titles
 from hma_jax.config import ConfigError
@@ -114,21 +111,12 @@ def test_the_documented_axis_is_drawn_without_its_file(documented, unrendered, t
     assert "seed 0 · temperature of the mixture 10" in page and "temperature of the mixture 3" not in page
 
 
-def test_an_axis_without_its_reference_is_refused_when_asked_for_but_a_recorded_one_is_drawn_and_continued(
-    tmp_path, unrendered, capsys
-):
-    """A finished study of an earlier version could be neither reported nor continued, by the command that it names."""
+def test_an_axis_without_its_reference_is_refused(tmp_path, capsys):
     root, path = tmp_path / "study", tmp_path / "mine.py"
-    root.mkdir()
     path.write_text(OWN.replace("(1, 3)", "(1, 10)").format("replace(trial, tau=float(x))"))
     for words in ["--preset", "smoke", "--dry-run"], ["--preset", "smoke", "--out", str(root)]:
         assert main(["sweep", str(path), *words]) == 2
         assert "reference_x 3 is not among the values (1, 10)" in " ".join(capsys.readouterr().err.split())
-    axes = keep_axes({"own": str(path)}, root)
-    draw(finished_study(root, axes=axes), record_of(axes=axes))
-    assert (root / "figures/own.png").exists()
-    command = whole_command(make_setup(StudyArguments("smoke", root)), axes)
-    assert main([*shlex.split(command)[1:], "--dry-run"]) == 0
 
 
 def test_files_are_kept_by_the_names_of_their_axes(tmp_path):

@@ -79,10 +79,7 @@ class SimulatedTruth:
         self._size = learned.tokenizer.image_size
 
     def about(self) -> dict[str, Any]:
-        """The length of demonstrations if it is not the one asked for. Earlier versions recorded the latter; left out
-        if no demonstration of that length could have succeeded."""
-        frames, asked = self._demonstrated_frames(), self.config.demonstration_frames
-        return {"demonstrated_frames": frames} if frames != asked and self.config.task.hold <= asked else {}
+        return {}
 
     def _demonstrated_frames(self) -> int:
         asked, task = self.config.demonstration_frames, self.config.task

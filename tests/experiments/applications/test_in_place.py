@@ -182,7 +182,7 @@ def test_a_detector_takes_no_other_one_s_place(ask, tmp_path, monkeypatch, capsy
     assert "runs/detector/detector.npz of this run exists already; remove it to" in said and "wrote" not in said
     with pytest.raises(ConfigError, match="runs/detector holds .*.run: 'RUN' -> 'OTHER'.; choose another --out"):
         ask("OTHER")
-    (tmp_path / "runs/detector/settings.json").unlink()  # as an earlier version left it
+    (tmp_path / "runs/detector/settings.json").unlink()
     with pytest.raises(
         ConfigError, match="detector.npz exists, but it is not known for which run it was trained; choose"
     ):

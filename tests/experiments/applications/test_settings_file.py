@@ -113,18 +113,14 @@ def test_how_latents_are_sampled_counts_in_models_on_latents_alone(tmp_path):
 
 
 def test_results_that_do_not_say_how_frames_were_filled_are_not_gone_on_with(tmp_path):
-    """As settings.json was written before it said so. Whoever knows that nothing has changed removes the file."""
+    """As some that are committed."""
     file, run = tmp_path / "settings.json", Path("runs/model")
     pin_settings(tmp_path, run, simulator(), SETTINGS)
     known = json.loads(file.read_text())
     del known["simulator"]
     file.write_text(json.dumps(known))
-    with pytest.raises(ConfigError, match="settings.json does not contain the decoding of frames.*remove this file"):
+    with pytest.raises(ConfigError, match="simulator: None -> "):
         pin_settings(tmp_path, run, simulator(), SETTINGS)
-    with pytest.raises(ConfigError, match="search.candidates: 4 -> 5"):
-        pin_settings(tmp_path, run, simulator(), SETTINGS | {"search": {"candidates": 5}})
-    file.unlink()
-    pin_settings(tmp_path, run, simulator(), SETTINGS)
 
 
 def test_more_of_the_same_is_not_otherwise(tmp_path):
@@ -167,7 +163,7 @@ def test_a_setting_of_decoding_that_came_later_has_the_value_from_before_in_a_fi
 
 
 @pytest.mark.parametrize("name", ["own_policy_chunk", "own_policy_grown"])
-def test_committed_policies_of_earlier_versions_can_be_gone_on_with(name):
+def test_committed_policies_can_be_gone_on_with(name):
     """Their files lack settings that came later."""
     known = json.loads((RESULTS / name / "settings.json").read_text())
     asked = own_policy.Settings(predicts="chunk" if name.endswith("chunk") else "noise", limits="spread")
