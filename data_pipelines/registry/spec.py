@@ -195,7 +195,7 @@ class DatasetSpec:
     def check_layout(self, robot: Embodiment, again: str = "") -> None:
         """Raises ConfigError unless an action's values are those of this `robot` of a model, in the same order;
         `again`: what else the user must do."""
-        if robot.layout and self.action_layout() != robot.layout:  # tables of earlier versions do not say
+        if robot.layout and self.action_layout() != robot.layout:  # converted models do not say
             raise ConfigError(
                 f"{self.name}: the action has other values, or another order of them, than when the model was "
                 f"trained: the registry's entry has {self._takes()}. Restore the entry of {self.name}{again}."
@@ -225,8 +225,8 @@ class DatasetSpec:
 
     @property
     def camera_key(self) -> str:
-        """`image_key` and `image_corrections` in one text: equal for equal frames. Without corrections it is the key,
-        as in earlier records of what was made from frames."""
+        """`image_key` and `image_corrections` in one text: equal for equal frames. Without corrections it is the
+        key."""
         return " ".join((self.image_key, *self.image_corrections))
 
     def correct(self, images: np.ndarray) -> np.ndarray:

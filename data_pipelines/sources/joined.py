@@ -65,8 +65,8 @@ class JoinedSource(EpisodeSource):
         """Hash over the parts' names and fingerprints, in order."""
         return self._hash([part.fingerprint() for part in self.parts])
 
-    def former_fingerprint(self) -> str:
-        return self._hash([part.former_fingerprint() for part in self.parts])
+    def fingerprint_with_texts(self) -> str:
+        return self._hash([part.fingerprint_with_texts() for part in self.parts])
 
     def _hash(self, fingerprints: Sequence[str]) -> str:
         text = ";".join(f"{part.name}:{own}" for part, own in zip(self.parts, fingerprints, strict=True))

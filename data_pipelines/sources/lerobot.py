@@ -74,7 +74,6 @@ class LeRobotSource:
 
     def identity(self) -> dict[str, Any]:
         files = {e.data for e in self.meta.episodes} | {f for e in self.meta.episodes for f, _ in e.videos.values()}
-        others = [f for f in self.vectors.values() if f.partition(".")[0] not in ("action", "observation")]
         sizes = {str(f.relative_to(self.root)): f.stat().st_size if f.exists() else -1 for f in sorted(files)}
         return {
             "root": self.root.name,
@@ -82,9 +81,7 @@ class LeRobotSource:
             "files": sizes,
             "cameras": list(self.cameras),
             "short_side": self.short_side,
-            # Earlier versions' conversions lack or do not count these, so their identity is different.
-            **({"others": others} if others else {}),
-            **({"lost": self._lost} if self._lost else {}),
+            "lost": self._lost,
         }
 
     @property

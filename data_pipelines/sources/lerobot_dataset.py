@@ -104,8 +104,8 @@ class LeRobotDataset(EpisodeSource):
     def _fingerprint(self) -> str:
         return self._with_sizes(hash_episodes(self.location, self._read.meta))
 
-    def former_fingerprint(self) -> str:
-        """The hash of earlier versions: over all files of the meta folder."""
+    def fingerprint_with_texts(self) -> str:
+        """Hash over all files of the meta folder, and over the names and sizes of all others."""
         return self._with_sizes(hash_meta(self.location))
 
     def _with_sizes(self, digest: Any) -> str:

@@ -66,8 +66,6 @@ class RobomimicSource:
             self.units = list(self.masks)
             demo = file["data"][self.units[0]]
             self.layout, self.cameras, self.ending, self.unsupported_images = self._read_layout(demo, settings.camera)
-            observed = [key for key in self.layout.vectors if key != "action"]
-            self.integers = [key for key in observed if demo[hdf5_path(key)].dtype.kind != "f"]  # and flags
         self.hz = float(settings.hz or self.recorded_hz or CONTROL_RATE)
         self.description = f"Robomimic demonstrations of {self.task} ({self.path.name}), {self.hz:g} Hz."
 
@@ -80,9 +78,7 @@ class RobomimicSource:
             "cameras": list(self.cameras),
             "hz": self.hz,
             "short_side": self.short_side,
-            # Earlier versions' conversions lack these, so their identity is different.
-            **({"integers": self.integers} if self.integers else {}),
-            **({"text": self.text} if self.text != self.task else {}),
+            "text": self.text,
         }
 
     @functools.cached_property

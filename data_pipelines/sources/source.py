@@ -149,15 +149,9 @@ class EpisodeSource(ABC):
     def fingerprint(self) -> str:
         """Hash of the contents, independent of the location."""
 
-    def former_fingerprint(self) -> str:
-        """The fingerprint of earlier versions, which also covered task texts."""
+    def fingerprint_with_texts(self) -> str:
+        """A fingerprint that also covers task texts."""
         return self.fingerprint()
-
-    def fingerprint_as(self, recorded: str) -> str:
-        """`recorded` if that is the former fingerprint of these contents, otherwise the fingerprint. So what earlier
-        versions made stays valid."""
-        own = self.fingerprint()
-        return recorded if recorded and recorded != own and recorded == self.former_fingerprint() else own
 
     @abstractmethod
     def sizes(self) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Arrays that stand beside a part's file of records: far smaller than the records, and needed more often.
 
-Owns their files. Stores of earlier versions lack some; readers then read the records.
+Owns their files.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ def write_beside(part: Path, kind: str, rows: np.ndarray, scratch: Path) -> None
     os.replace(scratch / path.name, path)
 
 
-def read_beside(part: Path, kind: str, rows: int, dtype: type, of: str, otherwise: str) -> np.ndarray | None:
+def read_beside(part: Path, kind: str, rows: int, dtype: type, of: str, advice: str) -> np.ndarray | None:
     """[rows, ...] of `dtype`; None if there is no such file beside `part`.
 
-    For messages, `of` says what the rows are ("the actions of 12 steps") and `otherwise` what is done without the file.
-    Raises DataError for a damaged file, UnreachableError if the disk fails.
+    For messages, `of` says what the rows are ("the actions of 12 steps") and `advice` what to do about a damaged file.
+    Raises DataError for that, UnreachableError if the disk fails.
     """
     path = beside(part, kind)
     try:
@@ -39,9 +39,9 @@ def read_beside(part: Path, kind: str, rows: int, dtype: type, of: str, otherwis
     try:
         found = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last one for a damaged header
-        raise DataError(f"{path}: {of} cannot be read ({error}). Remove the file, and {otherwise}.") from error
+        raise DataError(f"{path}: {of} cannot be read ({error}). {advice}") from error
     if found.ndim != 2 or len(found) != rows or found.dtype != dtype:
-        raise DataError(f"{path}: {found.dtype} {list(found.shape)} cannot be {of}. Remove the file, and {otherwise}.")
+        raise DataError(f"{path}: {found.dtype} {list(found.shape)} cannot be {of}. {advice}")
     return found
 
 

@@ -31,18 +31,12 @@ from data_pipelines.tokens.part_files import Part, PartFacts, read_part
 from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, locks_of
 from data_pipelines.tokens.row_sample import merge_samples
 from hma_jax.config import ConfigError, require
-from hma_jax.config.json import diff, identity_of, stable_hash
+from hma_jax.config.json import diff, stable_hash
 from hma_jax.runtime.files import IO_ERRNOS
 from hma_jax.runtime.locks import Held
 
 PART_SIZE = 256 * 2**20
 """Bytes of records in one part: the most work that a killed process loses."""
-
-FORMERLY_NAMED = frozenset(
-    "rate angles angle_form angle_unit episodes median_steps mean_steps val_split image_corrections joins "
-    "max_val_fraction action_quantiles runs recipe".split()
-)
-"""Fields that earlier versions hashed whatever their value. Fields that are added later are not among them."""
 
 
 def write_dataset(
@@ -104,22 +98,11 @@ def write_dataset(
 def differences(store_root: str | Path, plan: Manifest) -> list[str]:
     """The differences between the existing dataset of this name and the plan, one line per field.
 
-    Empty if there are none, or no such dataset. Raises DataError if it cannot be read, such as one of an older
+    Empty if there are none, or no such dataset. Raises DataError if it cannot be read, such as one of another
     format.
     """
     final = Path(store_root) / plan.spec.name
     return _changes(load_manifest(final / FILE), plan) if final.exists() else []
-
-
-def recorded_source(store_root: str | Path, name: str) -> str:
-    """The fingerprint of what the existing dataset of this name was made from; "" if there is none that can be read."""
-    final = Path(store_root) / name
-    try:
-        return load_manifest(final / FILE).source if final.exists() else ""
-    except UnreachableError:  # it may be intact
-        raise
-    except DataError:
-        return ""
 
 
 def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
@@ -140,11 +123,8 @@ def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
 
 
 def _work_directory(root: Path, plan: Manifest, parts: Sequence[Part]) -> Path:
-    """The directory in which the parts of a plan are made: the one that an earlier version began with, if there is
-    one."""
-    hashes = (stable_hash(identity_of([plan, list(parts)], named))[:12] for named in ((), FORMERLY_NAMED))
-    work, former = (root / f".{plan.spec.name}.{hash}" for hash in hashes)
-    return former if former.exists() else work
+    """The directory in which the parts of a plan are made."""
+    return root / f".{plan.spec.name}.{stable_hash([plan, list(parts)])[:12]}"
 
 
 def _attempt(maker: PartMaker, make: Make, progress: Progress | None) -> Manifest | None:
@@ -266,7 +246,7 @@ def _remove_others(final: Path, plan: Manifest, others: Sequence[Path]) -> None:
             outdated = bool(_changes(load_manifest(final / FILE), plan))
         except UnreachableError:  # it may be intact
             raise
-        except DataError:  # damaged, or of an older format
+        except DataError:  # damaged, or of another format
             outdated = True
         if outdated:
             remove(final)

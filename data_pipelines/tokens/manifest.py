@@ -40,9 +40,8 @@ RECIPE_VERSION = 1
 """Raise it when a change to the code alters what `tokenize_job` stores for the same source: tokens of an older version
 are then refused if new ones are asked for."""
 
-FORMAT_VERSION, READABLE_FORMATS = 3, (2, 3)
-"""The version of the store's layout, and the versions that can be read. Version 1 had one file per split; version 2
-stored the columns as JSON."""
+FORMAT_VERSION = 3
+"""The version of the store's layout; no other can be read."""
 
 
 @dataclass(frozen=True)
@@ -184,8 +183,7 @@ class Manifest:
         trajectories that are used; by default, of the whole train split.
 
         With the scale `quantiles`, a value that varies, but is the same number up to rounding (`DEAD_STD`) from its 1 %
-        to its 99 % quantile, is scaled by its extremes. Raises DataError for a manifest of a version that kept no
-        quantiles.
+        to its 99 % quantile, is scaled by its extremes. Raises DataError for a manifest without quantiles.
         """
         return self._embodiment(self.stride_at(rate), moments, scale, action_range)
 
@@ -219,7 +217,7 @@ class Manifest:
             return (), ()
         if not action_range.quantiles:
             raise DataError(
-                f"{self.spec.name}: its tokens were made by an earlier version, which stored no quantiles of actions. "
+                f"{self.spec.name}: the manifest of its tokens has no quantiles of actions. "
                 "Remove the dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
             )
         first, last, vary = (

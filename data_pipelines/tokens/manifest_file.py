@@ -1,4 +1,4 @@
-"""Reads a manifest from its files, in the current format or the previous one."""
+"""Reads a manifest from its files."""
 
 from __future__ import annotations
 
@@ -8,32 +8,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from data_pipelines.columns import Column, Columns
 from data_pipelines.errors import DataError
 from data_pipelines.names import truncate
 from data_pipelines.sources.rlds.location import retry
-from data_pipelines.tokens.manifest import COLUMNS_FILE, EPISODE_COLUMNS, READABLE_FORMATS, SPLITS, Manifest
-from hma_jax.config import ConfigError, require
+from data_pipelines.tokens.manifest import COLUMNS_FILE, EPISODE_COLUMNS, FORMAT_VERSION, SPLITS, Manifest
+from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict
 
 
 def load_manifest(path: Path) -> Manifest:
-    """Reads a manifest of the current format, or of the previous one, whose columns are in its JSON.
-
-    Raises DataError if it is missing, damaged or of another format, UnreachableError if the disk fails.
-    """
+    """Reads a manifest. Raises DataError if it is missing, damaged or of another format, UnreachableError if the disk
+    fails."""
     advice = "Remove the dataset from the store and tokenise it again."
     try:
         values = json.loads(retry(path, path.read_bytes))
-        if values.get("format") not in READABLE_FORMATS:
+        if values.get("format") != FORMAT_VERSION:
             raise DataError(
-                f"{path}: manifest format {values.get('format')!r}, but only "
-                f"{' and '.join(map(str, READABLE_FORMATS))} can be read. {advice}"
+                f"{path}: manifest format {values.get('format')!r}, but only {FORMAT_VERSION} can be read. {advice}"
             )
-        take = _from_json if values["format"] == 2 else _from_file
-        columns_by_split = take(path, values)
+        columns_by_split = _from_file(path, values)
         manifest = from_dict(Manifest, values)
         manifest.check()
         return replace(manifest, **{s: replace(manifest.split(s), **columns_by_split[s]) for s in SPLITS})
@@ -49,12 +43,6 @@ EpisodeColumns = dict[str, dict[str, Sequence[int]]]
 """Columns with an entry per episode, by split and name."""
 
 
-def _from_json(path: Path, values: dict[str, Any]) -> EpisodeColumns:
-    """Takes the columns out of a manifest of format 2."""
-    del path
-    return {s: {name: _integers(values[s].pop(name), f"{s}.{name}") for name in EPISODE_COLUMNS} for s in SPLITS}
-
-
 def _from_file(path: Path, values: dict[str, Any]) -> EpisodeColumns:
     """The columns in the file beside a manifest, which describes them."""
     stated = values.pop("columns")
@@ -68,9 +56,3 @@ def _from_file(path: Path, values: dict[str, Any]) -> EpisodeColumns:
             if len(column) != sum(values[split]["parts"]):
                 raise ValueError(f"{split}.{name} has {len(column)} entries, not one per episode")
     return {s: {n: c if len(c) else () for n, c in by_name.items()} for s, by_name in columns_by_split.items()}
-
-
-def _integers(values: list, name: str) -> Sequence[int]:
-    array = np.asarray(values or np.zeros(0, np.int64))
-    require(array.ndim == 1 and array.dtype.kind == "i", f"{name}: expected a list of integers")
-    return array if len(array) else ()

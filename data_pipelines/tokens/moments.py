@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.tokens.beside import read_beside
+from data_pipelines.errors import DataError
+from data_pipelines.tokens.beside import beside, read_beside
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,17 @@ MOMENTS = "moments"
 """The file beside a part with one row per training episode, in their order."""
 
 
-def read_moments(part: Path, episodes: int) -> np.ndarray | None:
-    """float64 [episodes, 1 + 2 A]; None in a store of earlier versions. Raises as `read_beside`."""
-    of = f"the action statistics of {episodes} episodes"
-    return read_beside(part, MOMENTS, episodes, np.float64, of, "they are computed again")
+def read_moments(part: Path, episodes: int) -> np.ndarray:
+    """float64 [episodes, 1 + 2 A]. Raises DataError for a file that is missing or damaged, UnreachableError if the disk
+    fails."""
+    of, advice = (
+        f"the action statistics of {episodes} episodes",
+        f"Remove {part.parent} and tokenise the dataset again.",
+    )
+    found = read_beside(part, MOMENTS, episodes, np.float64, of, advice)
+    if found is None:
+        raise DataError(f"{beside(part, MOMENTS)}: the file is missing from the token store. {advice}")
+    return found
 
 
 def merge_exactly(rows: np.ndarray, dim: int) -> Moments:

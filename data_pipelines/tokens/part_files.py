@@ -144,20 +144,21 @@ def read_part(directory: Path, part: Part) -> PartFacts | None:
 
 
 def read_actions(part: Path, steps: int) -> np.ndarray | None:
-    """float32 [steps, A]: the native actions of a part's episodes; None if only the records have them. Raises what
-    `read_beside` raises."""
-    of = f"the actions of {steps} steps"
-    return read_beside(part, ACTIONS, steps, np.float32, of, "they are read with the frames")
+    """float32 [steps, A]: the native actions of a part's episodes; None if only the records have them, as those without
+    frames. Raises as `read_beside`."""
+    of, advice = f"the actions of {steps} steps", "Remove the file, and they are read with the frames."
+    return read_beside(part, ACTIONS, steps, np.float32, of, advice)
 
 
 def _reads_beside(path: Path, split: str, own: PartSplit) -> bool:
-    """Whether the arrays beside the records at `path` belong to these episodes. A part of an earlier version lacks the
-    actions, and is valid without them."""
+    """Whether the arrays beside the records at `path` belong to these episodes."""
     try:
         read_actions(path, sum(own.steps))
-        return split != "train" or read_moments(path, len(own.episodes)) is not None
+        if split == "train":
+            read_moments(path, len(own.episodes))
     except DataError:
         return False
+    return True
 
 
 def _facts_path(directory: Path, part: Part) -> Path:

@@ -113,8 +113,8 @@ class TokenStore:
             ) from error
 
     def actions(self, name: str, split: str, i: int) -> np.ndarray:
-        """float32 [N, A], a copy: the native actions of episode `i` of a split, without reading its frames if a file
-        beside the records has them. Raises as `episode` does."""
+        """float32 [N, A], a copy: the native actions of episode `i` of a split, without reading its frames if it has
+        some. Raises as `episode` does."""
         part, at = self._locate(name, split, i)
         facts = self.manifest(name).split(split)
         with self._checking_not_replaced(name):
@@ -151,8 +151,7 @@ class TokenStore:
     def action_moments(self, name: str, episodes: np.ndarray) -> Moments:
         """Statistics of the actions of these training episodes only (int [N], positions in the store).
 
-        Reads the arrays beside each part or, in a store of earlier versions, the episodes themselves, which gives the
-        same bits. Raises as `episode`.
+        Reads the arrays beside each part. Raises as `episode`.
         """
         rows, ends = [], self._ends[name, "train"]
         episodes = np.sort(episodes)
@@ -161,11 +160,8 @@ class TokenStore:
             own = episodes[of_episode == part]
             with self._checking_not_replaced(name):
                 kept = read_moments(self._path(name, "train", part), self.manifest(name).train.parts[part])
-            if kept is None:
-                rows += [Moments.of(self.episode(name, "train", int(i)).actions).row for i in own]
-            else:
-                rows.append(kept[own - (ends[part - 1] if part else 0)])
-        return merge_exactly(np.concatenate([np.atleast_2d(x) for x in rows]), self.manifest(name).spec.action_dim)
+            rows.append(kept[own - (ends[part - 1] if part else 0)])
+        return merge_exactly(np.concatenate(rows), self.manifest(name).spec.action_dim)
 
     def check_table(self, table: EmbodimentTable, names: Sequence[str], rate: float | None) -> None:
         """Raises ConfigError unless `table` has each of `names` with the action layout stored here, at `rate`."""

@@ -26,7 +26,7 @@ from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import decoding_threads, fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource, count_skippable
-from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, recorded_source, write_dataset
+from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.encoder import Encoder
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import (
@@ -90,7 +90,6 @@ def tokenize_dataset(
     source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
     plan = plan_dataset(
         spec, source, tokenizer, held_out, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
-        recorded=recorded_source(store_root, spec.name),
     )  # fmt: skip
     watch = TurnWatch(spec, warn or (lambda _: None))
     work = _Work(source, plan, tokenizer, batch, threads or decoding_threads(), watch)
@@ -121,9 +120,8 @@ def plan_dataset(
     rate: float | None,
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
-    recorded: str = "",
 ) -> Manifest:
-    """The manifest of a dataset before it is made; `recorded` as in `EpisodeSource.fingerprint_as`.
+    """The manifest of a dataset before it is made.
 
     Raises ConfigError for settings that cannot work."""
     frame_step = resolve_frame_step(spec, frame_step, rate)
@@ -132,7 +130,7 @@ def plan_dataset(
         spec=spec.facts(),
         tokenizer=tokenizer_facts(tokenizer),
         settings=JobSettings(**to_dict(held_out), keep_frames=keep_frames, frame_step=frame_step),
-        source=source.fingerprint_as(recorded),
+        source=source.fingerprint(),
         source_version=source.version,
         action_mean=(),
         action_std=(),

@@ -55,8 +55,8 @@ class EvalManifest:
     store: str  # hash of the datasets' manifests
     datasets: tuple[DatasetWindows, ...] = field(default_factory=tuple)
     rate: float | None = FRAME_RATE  # frame rate in Hz; None: native
-    least: int = 0  # real frames of the shortest window; 0 in files from before there was padding
-    settings: ChoiceSettings | None = field(default=None, compare=False)  # None in files of earlier versions
+    least: int = 0  # real frames of the shortest window
+    settings: ChoiceSettings | None = field(default=None, compare=False)  # None: not recorded
 
     def hash(self) -> str:
         return stable_hash({f.name: getattr(self, f.name) for f in fields(self) if f.compare})
@@ -100,7 +100,7 @@ class EvalManifest:
             raise DataError(f"{path}: the evaluation set cannot be read ({reason}). {advice}") from error
         except (ValueError, AttributeError, TypeError) as error:
             raise DataError(f"{path}: not an evaluation set ({error}). {advice}") from error
-        if found != stated:  # hash of the file's own fields: a file of an earlier version lacks some
+        if found != stated:  # hash of the file's own fields, without those that came later
             raise DataError(f"{path}: its contents do not match the hash in it, {stated}: it was changed. {advice}")
         return manifest
 

@@ -22,7 +22,7 @@ from data_pipelines.sources.lerobot_meta import read_meta
 from data_pipelines.sources.rlds.example import encode_example, parse_record
 from data_pipelines.sources.rlds.schema import FEATURES, INFO, read_features, read_info, read_metadata
 from data_pipelines.sources.rlds.tfrecord import masked_crc32c, open_record, read_record, scan_shard
-from data_pipelines.tokens.manifest import COLUMNS_FILE, EPISODE_COLUMNS, FILE, SPLITS
+from data_pipelines.tokens.manifest import COLUMNS_FILE, FILE
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.release_folder import open_folder
 from tests.data_pipelines.fakes import REAL_DATA, OneDataset, make_features, make_spec
@@ -191,17 +191,10 @@ def _change_rest(rng: random.Random, data: bytes) -> bytes:
 def _manifest(root: Path) -> Target:
     sound = replace(OneDataset([5, 6, 7]).manifest("toy"), spec=replace(make_spec(dims=(2, 1)), camera="a"))
     sound = replace(sound, train=replace(sound.train, parts=(2, 1)))
-    now, before = root / "now", root / "before"
-    for home in (now, before):
-        home.mkdir()
-        sound.save(home, root)
-    values = json.loads((now / FILE).read_text())  # and as format 2 had it
-    del values["columns"]
-    values["format"] = 2
-    for split in SPLITS:
-        values[split] |= {name: list(getattr(sound.split(split), name)) for name in EPISODE_COLUMNS}
-    (before / FILE).write_text(json.dumps(values))
-    places = [(path, path.read_bytes()) for path in (now / FILE, before / FILE, now / COLUMNS_FILE)]
+    home = root / "manifest"
+    home.mkdir()
+    sound.save(home, root)
+    places = [(path, path.read_bytes()) for path in (home / FILE, home / COLUMNS_FILE)]
 
     def parse(data: bytes) -> None:
         path, there = places[data[0] % len(places) if data else 0]

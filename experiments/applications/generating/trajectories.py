@@ -123,8 +123,8 @@ class RldsTrajectories(Trajectories):
         not this robot's, DataError for more damage."""
         self._source = open_source(directory, split, corrupt="skip" if max_lost else "raise", max_skipped=max_lost)
         self.spec, self._robot, self._size = spec, robot, size
-        # The former one counts task texts, which are copied into what is generated.
-        self.name, self.split, self.fingerprint = spec.name, split, self._source.former_fingerprint()
+        self.name, self.split = spec.name, split
+        self.fingerprint = self._source.fingerprint_with_texts()  # they are copied into what is generated
         self.drawn_as = self._source.name if spec.joins else spec.name
         _require_fit(spec, robot)
         self._source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)

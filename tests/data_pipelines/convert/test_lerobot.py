@@ -9,7 +9,6 @@ import pytest
 
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
-from data_pipelines.sources.convertible import Skipped
 from data_pipelines.sources.lerobot import LeRobotSource
 from data_pipelines.sources.settings import LeRobotSettings
 from hma_jax.config import ConfigError
@@ -121,25 +120,6 @@ def test_malformed_tables_are_named_to_row_and_field(tmp_path, version, change, 
     source = LeRobotSource(write_lerobot(tmp_path / "toy", version, camera=camera, change=change))
     with pytest.raises(DataError, match=message):
         convert(source, tmp_path, "arm")
-
-
-def test_a_conversion_that_does_not_count_lost_episodes_is_not_taken_for_one_that_does(tmp_path):
-    """Earlier versions left them out of metadata.json, and their datasets, found again, had nothing left out."""
-
-    class Earlier(LeRobotSource):
-        def identity(self):
-            return {key: value for key, value in super().identity().items() if key != "lost"}
-
-        def read(self, unit):
-            return (item for item in super().read(unit) if not isinstance(item, Skipped))
-
-    root = write_lerobot(tmp_path / "arm", "v2.1", lengths=(12, 9, 7))
-    path = root / "meta" / "episodes.jsonl"
-    path.write_text("".join(path.read_text().splitlines(keepends=True)[::2]))
-    assert convert(Earlier(root, may_lose=True), tmp_path, "before").skipped == {}
-    with pytest.raises(ConfigError, match="or by an earlier version"):
-        convert(LeRobotSource(root, may_lose=True), tmp_path, "before")
-    assert [*convert(LeRobotSource(root, may_lose=True), tmp_path, "now").skipped.values()] == [1]
 
 
 def test_a_name_of_thousands_of_letters_does_not_fill_the_message(tmp_path):

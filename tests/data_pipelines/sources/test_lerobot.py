@@ -231,17 +231,16 @@ def test_the_statistics_are_hashed_once_while_no_file_changes(tmp_path, monkeypa
     assert len(found) == len(hashed) == 2
 
 
-def test_what_was_made_of_a_dataset_by_its_former_fingerprint_stays_in_use(tmp_path):
-    root = write_lerobot(tmp_path / "toy-arm", "v2.1")
-    made = tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "store")
-    source, path = open_source(root), tmp_path / "store" / "toy_arm" / "manifest.json"
-    former = source.former_fingerprint()
-    assert former not in (made.source, "")
-    path.write_text(path.read_text().replace(made.source, former))
-    assert tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "store").source == former
-    joined = JoinedSource("both", [source, source], "raise", 0)
-    assert joined.fingerprint_as(joined.former_fingerprint()) == joined.former_fingerprint() != joined.fingerprint()
-    assert joined.fingerprint_as("other") == joined.fingerprint()
+def test_a_text_changes_one_fingerprint_alone(tmp_path):
+    def prints(word: str) -> list[str]:
+        root = write_lerobot(tmp_path / word / "toy-arm", "v2.1")
+        tasks = root / "meta" / "tasks.jsonl"
+        tasks.write_text(tasks.read_text().replace("push", word))
+        source = open_source(root)
+        joined = JoinedSource("both", [source, source], "raise", 0)
+        return [s for one in (source, joined) for s in (one.fingerprint(), one.fingerprint_with_texts())]
+
+    assert [a == b for a, b in zip(prints("push"), prints("pull"), strict=True)] == [True, False] * 2
 
 
 def test_more_lost_episodes_than_can_be_named_are_damage_whatever_is_allowed(tmp_path):

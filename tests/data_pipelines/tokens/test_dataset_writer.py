@@ -10,7 +10,6 @@ import shutil
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +17,11 @@ import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.publishing.output_lock import lock_output
-from data_pipelines.registry import DatasetSpec
-from data_pipelines.tokens import dataset_writer
 from data_pipelines.tokens.beside import beside
 from data_pipelines.tokens.dataset_writer import cut_parts
 from data_pipelines.tokens.moments import MOMENTS, Moments, merge_all, read_moments
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
-from hma_jax.config.base import later
-from hma_jax.config.json import identity_of, to_dict
 from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.tokens.job_process import SPEC, run, start
 from tests.files import contents
@@ -84,29 +79,6 @@ def test_finished_parts_are_not_made_again(rlds, tmp_path):
     assert {tmp_path / "toy" / p.name: t for p, t in parts.items()}.items() <= {
         p: p.stat().st_mtime_ns for p in (tmp_path / "toy").iterdir()
     }.items()
-
-
-def test_what_an_earlier_version_began_is_finished(rlds, undisturbed, tmp_path, monkeypatch):
-    """Its name for the same job was of all fields that the plan had then, whatever is added to it."""
-
-    @dataclass(frozen=True)
-    class More(DatasetSpec):
-        added: float = later(0.0)
-
-    def with_fields_of_then(job, _):
-        plan, parts = to_dict(job)
-        del plan["settings"]["max_train"]  # which came later
-        return [plan, parts]
-
-    def with_one_more(job, named):
-        return identity_of([replace(job[0], spec=More(**vars(job[0].spec))), job[1]], named)
-
-    monkeypatch.setattr(dataset_writer, "identity_of", with_fields_of_then)
-    begin(rlds, tmp_path)
-    monkeypatch.setattr(dataset_writer, "identity_of", with_one_more)
-    first = []
-    run(rlds, tmp_path, progress=lambda done, total: first.append(done))
-    assert first[0] >= 6 and contents(tmp_path) == undisturbed
 
 
 def begin(rlds: Path, store: Path, **options) -> Path:

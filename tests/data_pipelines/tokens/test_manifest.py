@@ -15,52 +15,9 @@ from data_pipelines.errors import DataError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.manifest import SplitFacts
 from data_pipelines.tokens.manifest_file import load_manifest
-from data_pipelines.tokens.store import TokenStore
-from data_pipelines.windows.windows import train_windows
-from tests.data_pipelines.fakes import FakeTokenizer, OneDataset, make_spec, write_rlds
-from tests.data_pipelines.tokenizing import tokenize_dataset
+from tests.data_pipelines.fakes import OneDataset, make_spec
 
 SPEC = make_spec()
-
-FORMAT_2 = """{
- "action_max": [6.0, 10.0, 0.0],
- "action_mean": [3.1739130434782608, 3.58695652173913, 0.0],
- "action_min": [0.0, 0.0, 0.0],
- "action_std": [1.9924242151981915, 2.6091485114173514, 0.0],
- "format": 2,
- "settings": {"frame_step": 2, "keep_frames": "val", "max_val": 200, "min_val": 2, "val_fraction": 0.05},
- "skipped": [],
- "source": "389662f0f93c0e65",
- "source_version": "1.0.0",
- "spec": {"action_dims": [3], "action_keys": ["action"], "camera": "", "hz": 4, "image_key": "observation/image",
-  "name": "toy", "note": "", "split": "train", "unverified": "", "version": "", "video_targets": true},
- "tokenizer": {"channels": 0, "factor_vocab": 256, "factors": 2, "grid": 2, "identity": "fake", "image_size": 8,
-  "tokens": 4, "vocab_size": 65536},
- "train": {"content": "219c1a943eebee0e60c435f0cf749f4d", "episodes": [0, 1, 2, 3, 4, 6], "parts": [6],
-  "steps": [5, 6, 7, 8, 9, 11]},
- "val": {"content": "d818360a9cc70f197ee16b2460da55ae", "episodes": [5, 7], "parts": [2], "steps": [10, 12]}
-}
-"""
-"""As commit 3caafdd wrote it, of eight episodes of `write_rlds`."""
-
-
-def test_a_store_of_the_format_before_is_read_and_keeps_its_identity(tmp_path):
-    (tmp_path / "toy").mkdir()
-    (tmp_path / "toy/manifest.json").write_text(FORMAT_2)
-    store = TokenStore(tmp_path)
-    assert store.manifest("toy").hash() == "e385554ab1617f45" and store.hash() == "c0e0dd2b43268632"
-    assert store.manifest("toy").val.episodes == (5, 7) and store.manifest("toy").train.steps == (5, 6, 7, 8, 9, 11)
-    assert train_windows(store, "toy", 2, 3, rate=2.0).episodes.tolist() == [0, 2, 5]  # the subset that it had
-
-
-def test_a_store_of_the_format_before_is_not_made_again(tmp_path):
-    rlds = write_rlds(tmp_path / "rlds", SPEC, [5, 6, 7, 8, 9, 10, 11, 12], shards=2)
-    path = tmp_path / "store" / "toy" / "manifest.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(FORMAT_2)
-    manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
-    assert manifest.format == 2 and path.read_text() == FORMAT_2
-    assert [p.name for p in path.parent.iterdir()] == ["manifest.json"]
 
 
 @pytest.fixture
@@ -177,12 +134,3 @@ def test_a_column_that_claims_more_than_its_file_is_refused(tmp_path):
     with pytest.raises(DataError, match="reaches beyond the end of the file"):
         columns["x"]
     assert json.dumps(columns.facts) == "{}"
-
-
-def test_manifest_of_format_2_with_an_empty_split_has_its_hash(tmp_path):
-    values = json.loads(FORMAT_2)
-    values["val"] |= {"episodes": [], "steps": [], "parts": []}
-    path = tmp_path / "manifest.json"
-    path.write_text(json.dumps(values))
-    manifest = load_manifest(path)
-    assert len(manifest.val.episodes) == 0 and manifest.hash()

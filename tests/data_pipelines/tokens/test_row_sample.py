@@ -208,5 +208,5 @@ def test_a_store_without_quantiles_is_read_and_says_what_it_lacks(tmp_path):
     path.write_text(json.dumps(values))
     manifest = load_manifest(path)
     assert manifest.embodiment(rate=2.0).low == ()
-    with pytest.raises(DataError, match="toy: its tokens .* stored no quantiles.*train.action_scale=deviation"):
+    with pytest.raises(DataError, match="toy: .* has no quantiles of actions.*train.action_scale=deviation"):
         manifest.embodiment(scale="quantiles", rate=2.0)

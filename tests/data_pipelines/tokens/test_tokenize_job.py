@@ -232,7 +232,7 @@ def test_unusable_episode_stops_the_job_or_is_skipped_and_recorded(tmp_path):
     (loss,) = manifest.skipped
     assert (loss.file, loss.offset, loss.episodes) == ("toy-train.tfrecord-00000-of-00001", 0, 1)
     stored = json.loads((tmp_path / "store/toy/manifest.json").read_text())["skipped"]
-    assert [sorted(entry) for entry in stored] == [["episodes", "file", "offset", "reason"]]  # as of earlier versions
+    assert [sorted(entry) for entry in stored] == [["episodes", "file", "offset", "reason"]]
     assert "episode 0" in loss.reason and str(tmp_path) not in loss.reason
     assert load_manifest(tmp_path / "store/toy/manifest.json") == manifest
 
@@ -273,7 +273,7 @@ def test_manifest_is_json_that_people_can_read(tmp_path, rlds):
 
 
 def test_a_limit_on_what_is_held_out_that_changes_nothing_makes_no_other_store(tmp_path, rlds):
-    """Stores of earlier versions have the limit 0.5, which is the same two of eight episodes."""
+    """With the limit 0.5 the same two of eight episodes are held out."""
     there = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", max_val_fraction=0.5)
     assert tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store") == there
     with pytest.raises(ConfigError, match="settings.max_val_fraction: 0.5 -> 0.125"):

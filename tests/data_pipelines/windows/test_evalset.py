@@ -15,7 +15,6 @@ from data_pipelines.windows.evalset import (
     subsample_windows,
 )
 from hma_jax.config import ConfigError
-from hma_jax.config.json import stable_hash, to_dict
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 from tests.data_pipelines.tokenizing import tokenize_dataset
 
@@ -218,15 +217,6 @@ def test_short_episodes_are_judged_up_to_their_end(tmp_path):
     assert whole.names == ("long",) and "real" not in next(
         eval_batches(store, store.embodiment_table(("long",), rate=2.0), whole, 2)
     )
-
-
-def test_windows_frozen_by_an_earlier_version_are_read(manifest, tmp_path):
-    """Their file has neither a rate nor a least number of frames."""
-    path = tmp_path / "eval.json"
-    values = {k: v for k, v in to_dict(manifest).items() if k not in ("rate", "least", "settings")}
-    path.write_text(json.dumps({"hash": stable_hash(values), **values}))
-    old = EvalManifest.load(path)
-    assert (old.rate, old.least, old.settings, old.datasets) == (2.0, 0, None, manifest.datasets)
 
 
 def test_the_rate_is_that_of_the_frames(tmp_path):

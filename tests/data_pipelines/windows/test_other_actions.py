@@ -102,7 +102,7 @@ def test_no_frames_are_read_to_get_their_actions(tmp_path, monkeypatch):
 
     (_, alone), (batch, with_others) = read(0), read(3)
     assert alone == with_others == len(set(batch["episode"].tolist())) > 0
-    for path in (tmp_path / "s").glob("*/val-*.actions.npy"):  # of an earlier version, which had them in records alone
+    for path in (tmp_path / "s").glob("*/val-*.actions.npy"):  # as of splits without frames: in records alone
         path.unlink()
     same, more = read(3)
     np.testing.assert_array_equal(same["other_actions"], batch["other_actions"])
