@@ -31,10 +31,6 @@ On CPUs diffusion heads keep everything, because XLA merges their second computa
 Attention = Literal["auto", "plain", "cpu", "cudnn", "splash"]
 """What computes attention (`hma_jax.kernels`); `auto` takes what suits the platform and the shapes."""
 
-FORMER_FIELDS = {"model": ("compute_dtype", "remat", "attention"), "train": ("accumulate",)}
-"""Fields of earlier versions' model and train configurations that describe execution, not identity; they are dropped
-before runs are compared."""
-
 
 @dataclass(frozen=True)
 class MeshConfig:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection
 from typing import Any
 
 from hma_jax.config.base import BEFORE, SCALARS, as_declared, as_scalar, hints_of, require
@@ -23,27 +22,26 @@ def to_dict(config: Any) -> Any:
     return _plain(config)
 
 
-def identity_of(config: Any, named: Collection[str] = ()) -> Any:
+def identity_of(config: Any) -> Any:
     """What names `config` and what it is compared by: `to_dict` without the later fields (`base.later`) that have the
-    value which computes what was computed before. It is equal for equal results, whatever fields are added. The fields
-    in `named` stay whatever their value, as in names that earlier versions gave."""
-    return _plain(config, named)
+    value which computes what was computed before. It is equal for equal results, whatever fields are added."""
+    return _plain(config, names=True)
 
 
-def _plain(config: Any, named: Collection[str] | None = None) -> Any:
-    """`to_dict` where `named` is None, otherwise `identity_of`."""
+def _plain(config: Any, names: bool = False) -> Any:
+    """`to_dict` or, with `names`, `identity_of`."""
     if config is None or isinstance(config, (str, int, float)):  # most of what there is
         return config
     if dataclasses.is_dataclass(config):
-        values = {f.name: _plain(getattr(config, f.name), named) for f in dataclasses.fields(config)}
-        for f in () if named is None else dataclasses.fields(config):
-            if BEFORE in f.metadata and f.name not in named and values[f.name] == _plain(f.metadata[BEFORE], named):
+        values = {f.name: _plain(getattr(config, f.name), names) for f in dataclasses.fields(config)}
+        for f in dataclasses.fields(config) if names else ():
+            if BEFORE in f.metadata and values[f.name] == _plain(f.metadata[BEFORE], names):
                 del values[f.name]
         return values
     if isinstance(config, (tuple, list)):
-        return [_plain(v, named) for v in config]
+        return [_plain(v, names) for v in config]
     if isinstance(config, dict):
-        return {k: _plain(v, named) for k, v in config.items()}
+        return {k: _plain(v, names) for k, v in config.items()}
     return config
 
 

@@ -65,7 +65,7 @@ def read_neutral(directory: Path) -> Run:
     fields = {"format", "version", "step", "weights", "model", "train", "table", "provenance", "tensors"}
     found = set(description) if isinstance(description, dict) else set()
     require(
-        found | {"weights"} == fields and description["format"] == FORMAT,
+        found == fields and description["format"] == FORMAT,
         f"{path}: not a model description of this project: its fields are {', '.join(sorted(found)) or 'none'}, but "
         f"{', '.join(sorted(fields))} were expected",
     )
@@ -80,8 +80,7 @@ def read_neutral(directory: Path) -> Run:
         kind = type(description[name]).__name__
         require(isinstance(description[name], dict), f"{path}: {name}: expected named fields, got {kind}")
     model, train, table = read_configs(description, str(path))
-    # Earlier versions did not state which weights; by default they wrote the average where there was one.
-    which = description.get("weights", "ema" if train.ema_decay else "last")
+    which = description["weights"]
     require_choice(which, ("last", "ema"), f"{path}: weights")
     leaves = declare_model(model, table).leaves()
     want = describe_tensors(leaves)

@@ -327,7 +327,7 @@ def _unchanged_since_import(run: Run) -> bool:
         return False
     if read_model(source["config"], CONFIG) != run.model:
         return False
-    return "weights" not in source or source["weights"] == _hash_of(run.params)  # earlier versions recorded none
+    return source["weights"] == _hash_of(run.params)
 
 
 def _hash_of(params: Params) -> str:

@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FILE = "windows.parquet"
-LEGACY_FILE = "windows.csv.gz"
-"""The file that earlier versions wrote."""
-
 COLUMNS = ("dataset", "episode", "start", "frames")
 """Fields of a `WindowTable` besides its metrics."""
 
@@ -172,9 +169,7 @@ class WindowTable:
         try:
             return cls.from_arrow(read_arrow(path))
         except (OSError, ValueError, KeyError, pa.ArrowException) as error:
-            legacy = Path(path).with_name(LEGACY_FILE)
-            reason = f"{legacy.name} beside it was written by an earlier version" if legacy.exists() else error
-            raise ConfigError(f"{path}: the table of windows cannot be read ({reason}). Evaluate again.") from error
+            raise ConfigError(f"{path}: the table of windows cannot be read ({error}). Evaluate again.") from error
 
 
 def write_arrow(path: Path, table: pa.Table) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 
 from hma_jax.config import ConfigError, MaskingConfig, OptimizerConfig, require
 from hma_jax.runtime.files import sync, sync_tree, write_file
-from hma_jax.training.reading import list_steps, read_description, require_finished
+from hma_jax.training.reading import list_steps, read_description
 from hma_jax.training.run_lock import CHECKPOINTS, locked_run
 
 LOGS = ("metrics.jsonl", "validation.jsonl", "timing.jsonl")
@@ -96,7 +96,6 @@ def branch(source: Path, run_dir: Path, step: int | None = None) -> int:
         step > 0,
         f"{source} was converted, so it has nothing to go on with but its weights: `hma train --from` starts with these",
     )
-    require_finished(source / CHECKPOINTS / str(step))  # alone in `run_dir` it would look like an early version's
     described = read_description(source / CHECKPOINTS / str(step))
     require("train" in described, f"{source} is not a run of a model; give the directory of a training run")
     earlier = described["provenance"].get("branched", [])

@@ -20,7 +20,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -48,9 +48,6 @@ from hma_jax.training.reading import (
 from hma_jax.training.run_lock import require_plain
 
 Description = dict[str, Any]
-
-Load = Callable[[Path, Mapping[str, Any]], dict[str, Any]]
-"""Reads the items of a checkpoint, as `load_items`."""
 
 UNFINISHED, REMOVED = ".unfinished", ".removed"
 """How the names of checkpoints end that are being written, or removed."""
@@ -280,9 +277,8 @@ class Checkpoints:
         shapes: Any,
         may_change: Callable[[Description, int], tuple[str, ...]] = lambda saved, step: (),
         skip_damaged: bool = False,
-        load: Load = load_items,
     ) -> tuple[int, Any]:
-        """(step, state) of the latest checkpoint, laid out as `shapes` (jax.ShapeDtypeStruct) say, and read by `load`.
+        """(step, state) of the latest checkpoint, laid out as `shapes` (jax.ShapeDtypeStruct) say.
 
         `may_change(description, step)` gives the fields of the checkpoint's description (such as 'train.steps') that
         may differ. With `skip_damaged`, damaged checkpoints after the newest whole one are moved to `damaged` beside
@@ -315,7 +311,7 @@ class Checkpoints:
                 "these fields:\n  " + "\n  ".join(changes)
             )
         wanted = {name: item for name, item in shapes._asdict().items() if item is not None}
-        return step, type(shapes)(**load(checkpoint, wanted))
+        return step, type(shapes)(**load_items(checkpoint, wanted))
 
     def _move_damaged_away(self) -> None:
         damaged = []

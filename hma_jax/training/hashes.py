@@ -67,8 +67,9 @@ def read_list(checkpoint: Path) -> str:
     return path.read_text() if path.exists() else ""
 
 
-def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[int, int] = (0, 1)) -> bool:
-    """Compares the `chosen` files with the list. False if there is no list.
+def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[int, int] = (0, 1)) -> None:
+    """Compares the `chosen` files with the list. A checkpoint that training has removed in the meantime is not an error
+    here.
 
     With `share` (i, n) process i of n compares every n-th file, so that each file is read by one process. Raises
     Damaged for the first file that is missing or differs, the list itself included, and ReadError for one that cannot
@@ -77,15 +78,16 @@ def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[in
     path = checkpoint / NAME
     try:
         text = path.read_text()
-    except FileNotFoundError:
-        return False
+    except FileNotFoundError as error:
+        if not checkpoint.is_dir():
+            return
+        raise Damaged(path, "is missing, so the checkpoint was not copied to its end") from error
     except OSError as error:
         raise ReadError.of(path, error.strerror) from error
     except ValueError as error:
         raise Damaged(path, f"cannot be read ({error})") from error
     rows = [row for row in _rows(path, text) if chosen(row[0])]
     _in_threads(lambda row: _compare(checkpoint / row[0], *row[1:]), rows[share[0] :: share[1]])
-    return True
 
 
 def _rows(path: Path, text: str) -> list[Row]:

@@ -35,10 +35,10 @@ from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.exits import Exit, leave_stop_pending, take_pending_stop, take_signal
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import AgreedMaximum, barrier, is_writer
-from hma_jax.training.checkpoints import Checkpoints, Description, Load, SaveError
+from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
 from hma_jax.training.divergence import Records, require_finite
 from hma_jax.training.log import Progress, RunLog, SilentLog, open_log
-from hma_jax.training.reading import agree_on_latest, load_items
+from hma_jax.training.reading import agree_on_latest
 from hma_jax.training.run_lock import CHECKPOINTS, locked_run
 from hma_jax.training.state import FINITE
 from hma_jax.training.step_trace import PROFILE, StepTrace
@@ -99,8 +99,6 @@ class RunInfo:
     modernise: Callable[[Description], Description] = lambda described: described
     # Called for the error message when the numbers of a step were not finite.
     records: Records = lambda index: ()
-    # Reads a state, including one that an earlier version wrote.
-    load: Load = load_items
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,7 @@ def fit(
         if agree_on_latest(checkpoints.directory) is None:
             start, state = 0, make_state()
         else:
-            start, state = checkpoints.restore(shapes, options.may_change, options.skip_damaged, info.load)
+            start, state = checkpoints.restore(shapes, options.may_change, options.skip_damaged)
         log = open_log(
             run_dir,
             start,

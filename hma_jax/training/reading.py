@@ -22,11 +22,8 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime.processes import all_gather, broadcast_from_writer, is_writer
-from hma_jax.training.hashes import NAME, Damaged, ReadError, verify
+from hma_jax.training.hashes import Damaged, ReadError, verify
 from hma_jax.training.run_lock import list_steps
-
-WHOLE_STATE = "state"
-"""The single item of checkpoints that were written before there were several items."""
 
 log = logging.getLogger(__name__)
 
@@ -72,80 +69,45 @@ def raised_in_all(name: str) -> Iterator[None]:
 def find_damage(checkpoint: Path) -> Damaged | None:
     """The first damaged file; None if there is none. Raises ReadError."""
     try:
-        if not verify(checkpoint):
-            _require_listed(checkpoint)
+        verify(checkpoint)
     except Damaged as damage:
         return damage
     return None
 
 
 def require_finished(checkpoint: Path) -> None:
-    """Raises CheckpointError, in all processes, if writing `checkpoint` was interrupted."""
+    """Raises CheckpointError, in all processes, if the list of the files of `checkpoint` is missing or damaged."""
     with raised_in_all("finished"), _reading(checkpoint):
-        _require_listed(checkpoint)
-
-
-def _require_listed(checkpoint: Path) -> None:
-    """Raises Damaged for a checkpoint without a list of hashes after one that has a list: it is then unknown whether
-    its files are as they were written. If no checkpoint has a list, an early version that wrote none made them. A
-    checkpoint that training has removed in the meantime is not an error here."""
-    if (checkpoint / NAME).exists() or not checkpoint.is_dir():
-        return
-    earlier = [step for step in list_steps(checkpoint.parent) if step < int(checkpoint.name)]
-    if any((checkpoint.parent / str(step) / NAME).exists() for step in earlier):
-        raise Damaged(checkpoint / NAME, "is missing, so it was not written or copied to its end")
+        verify(checkpoint, lambda name: False)
 
 
 def read_description(checkpoint: Path) -> dict[str, Any]:
     """The description of the run that wrote the checkpoint. Raises CheckpointError if its files are damaged, ReadError
     if they cannot be read at the moment."""
     with _reading(checkpoint):
-        listed = verify(checkpoint, lambda name: "/" not in name)
-        if not listed:
-            log.warning(
-                "%s has no list of its files (it was written by an earlier version, or writing was interrupted): it "
-                "is read without checking their hashes",
-                checkpoint,
-            )
+        verify(checkpoint, lambda name: "/" not in name)
         # Orbax warns, for every item, about a path that is not absolute.
         return ocp.checkpointables_metadata(checkpoint.absolute()).custom_metadata or {}
 
 
-def load_items(checkpoint: Path, shapes: Mapping[str, Any], partial: bool = False) -> dict[str, Any]:
+def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
     """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says, or in host memory if the
-    tree is of NumPy arrays (`on_host`). With `partial`, the trees may lack arrays that the checkpoint has.
+    tree is of NumPy arrays (`on_host`).
 
     With several processes all call this. Raises CheckpointError if a file of these items is damaged or missing,
     ReadError if one cannot be read at the moment.
     """
     share = jax.process_index(), jax.process_count()
-    with raised_in_all("damage"):
-        old = has_item(checkpoint, WHOLE_STATE)
-        folders = {WHOLE_STATE} if old else set(shapes)
-        with _reading(checkpoint):
-            verify(checkpoint, lambda name: name.split("/")[0] in folders, share)
+    with raised_in_all("damage"), _reading(checkpoint):
+        verify(checkpoint, lambda name: name.split("/")[0] in shapes, share)
     with _reading(checkpoint):
-        context = ocp.Context()
-        context.pytree.loading.partial_load = old or partial
-        with context:
-            return (ocp.load if old else ocp.load_checkpointables)(checkpoint, dict(shapes))
+        return ocp.load_checkpointables(checkpoint, dict(shapes))
 
 
 def on_host(shapes: Any) -> Any:
     """A tree of shapes (jax.ShapeDtypeStruct) as a tree of NumPy arrays, which take no memory themselves. With it Orbax
     reads into host memory, not onto devices."""
     return jax.tree.map(lambda x: np.broadcast_to(np.zeros((), x.dtype), x.shape), shapes)
-
-
-def saved_shapes(checkpoint: Path, item: str, field: str) -> Any:
-    """A tree of the shapes of the arrays in a field of an item. With several processes all call this. Raises as
-    `load_items`."""
-    old = (checkpoint / WHOLE_STATE).is_dir()
-    folder = WHOLE_STATE if old else item
-    with raised_in_all("shapes"), _reading(checkpoint):
-        verify(checkpoint, lambda name: name.split("/")[0] == folder, (jax.process_index(), jax.process_count()))
-        found = ocp.checkpointables_metadata(checkpoint.absolute()).metadata[folder]
-        return jax.tree.map(lambda x: tuple(x.shape), (found[item] if old else found)[field])
 
 
 def has_item(checkpoint: Path, name: str) -> bool:

@@ -14,7 +14,6 @@ import numpy as np
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, Weights, require
 from hma_jax.config.base import require_choice
-from hma_jax.config.execution import FORMER_FIELDS
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.config.training import PREDICT_FRAMES
 from hma_jax.model.embodiments import EmbodimentTable
@@ -123,9 +122,7 @@ def read_configs(described: dict[str, Any], where: str) -> tuple[ModelConfig, Tr
     """
 
     def read(name: str, kind: type) -> Any:
-        former = FORMER_FIELDS.get(name, ())
-        values = {key: value for key, value in described[name].items() if key not in former}
-        return from_dict(kind, values, f"{where}: {name}")
+        return from_dict(kind, described[name], f"{where}: {name}")
 
     return read("model", ModelConfig), read("train", TrainConfig), read("table", EmbodimentTable)
 

@@ -29,9 +29,7 @@ from hma_jax.runtime.sharding import put_batch, replicated
 from hma_jax.training import branch
 from hma_jax.training.divergence import Records
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, RunInfo, fit
-from hma_jax.training.old_checkpoints import load_trained
 from hma_jax.training.optimizer import steps_in_common
-from hma_jax.training.reading import load_items
 from hma_jax.training.runs import describe_run, modernise
 from hma_jax.training.state import init_state, state_shapes
 from hma_jax.training.step import make_train_step
@@ -46,7 +44,6 @@ def train_model(
     *,
     run_dir: str | Path,
     provenance: dict[str, Any],
-    modernise_provenance: Callable[[dict[str, Any]], dict[str, Any]] = dict,
     execution: ExecutionConfig = ExecutionConfig(),
     options: LoopOptions = LoopOptions(),
     validation: Validation | None = None,
@@ -58,10 +55,9 @@ def train_model(
 
     `make_batches(start)` gives this process's rows (`runtime.rows.own_rows`) of the global batches from step `start`
     on. A new run starts from a copy of the `initial` parameters, or from randomly drawn ones. `provenance` says what
-    data the batches come from; resuming on other data is refused. `modernise_provenance` converts a provenance that an
-    earlier version wrote to the current form before the two are compared. `execution` and `validation` may differ when
-    a run resumes. `records` names the records of a batch, for the message when its step is not finite. Raises
-    ConfigError, CheckpointError, SaveError, DivergedError, Interrupted.
+    data the batches come from; resuming on other data is refused. `execution` and `validation` may differ when a run
+    resumes. `records` names the records of a batch, for the message when its step is not finite. Raises ConfigError,
+    CheckpointError, SaveError, DivergedError, Interrupted.
     """
     declared = declare_model(model, table, execution)
     mesh = execution.mesh
@@ -89,10 +85,6 @@ def train_model(
         require(len(padded) == 1, "some batches have `real`, the marks of padding, and some do not; give it with all")
         return put(batch) | {"seed": seed}
 
-    def modernised(described: dict[str, Any]) -> dict[str, Any]:
-        today = modernise(described)
-        return today | {"provenance": modernise_provenance(today["provenance"])}
-
     branched = branch.read_branchings(Path(run_dir))
     if branched:
         provenance = provenance | {"branched": branched}
@@ -101,11 +93,6 @@ def train_model(
         step = _jitted_step(make_train_step, model, program_table, replace(config, seed=0), execution, device_mesh)
         seed = jax.device_put(jax.random.key_data(key_of(config.seed)), replicated(device_mesh))
 
-        def load(checkpoint: Path, wanted: Mapping[str, Any]) -> dict[str, Any]:
-            if not config.only:
-                return load_items(checkpoint, wanted)
-            return load_trained(checkpoint, wanted, declared, np.isin(table.names, config.only))
-
         return fit(
             step,
             shapes,
@@ -113,7 +100,7 @@ def train_model(
             make_batches,
             steps=config.steps,
             run_dir=run_dir,
-            info=RunInfo(describe_run(model, config, table, provenance), to_dict(execution), modernised, records, load),
+            info=RunInfo(describe_run(model, config, table, provenance), to_dict(execution), modernise, records),
             put_batch=put_checked,
             options=replace(
                 options,

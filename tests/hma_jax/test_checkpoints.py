@@ -66,7 +66,7 @@ def test_several_processes_read_every_file_once(run_dir: Path, monkeypatch):
     monkeypatch.setattr(hashes, "_compare", lambda path, *_: read.append(path))
     for share in range(3):
         before = len(read)
-        assert verify(checkpoint, share=(share, 3))
+        verify(checkpoint, share=(share, 3))
         assert len(read) > before
     assert sorted(p.relative_to(checkpoint).as_posix() for p in read) == [n for n in files_of(checkpoint) if n != NAME]
 
@@ -198,16 +198,7 @@ def test_a_run_without_a_whole_checkpoint_is_not_started_again_in_silence(run_di
     assert list_steps(run_dir / "checkpoints") == [4, 6]
 
 
-def test_a_checkpoint_without_a_list_is_read_with_a_remark(run_dir: Path, caplog: pytest.LogCaptureFixture):
-    """An earlier version wrote it, and those before it."""
-    for step in ("4", "6"):
-        (run_dir / "checkpoints" / step / NAME).unlink()
-    with caplog.at_level(logging.WARNING):
-        assert fit_toy(run_dir, 8).resumed_from == 6
-    assert "without checking their hashes" in caplog.text
-
-
-def test_a_checkpoint_whose_list_is_missing_after_one_that_has_it_counts_as_damaged(run_dir: Path):
+def test_a_checkpoint_whose_list_is_missing_counts_as_damaged(run_dir: Path):
     """Orbax reads a flipped bit of it without an error."""
     checkpoint = run_dir / "checkpoints" / "6"
     (checkpoint / NAME).unlink()
@@ -221,9 +212,11 @@ def test_a_checkpoint_whose_list_is_missing_after_one_that_has_it_counts_as_dama
 def test_the_list_is_whole_or_absent(tmp_path: Path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "b").write_bytes(b"12")
-    assert verify(tmp_path) is False
+    with pytest.raises(Damaged, match=f"{NAME}: is missing"):
+        verify(tmp_path)
     write_list(tmp_path)
-    assert verify(tmp_path) is True and files_of(tmp_path) == ["a/b", NAME]
+    verify(tmp_path)
+    assert files_of(tmp_path) == ["a/b", NAME]
     listed = (tmp_path / NAME).read_bytes()
     for at in range(len(listed)):
         flip(tmp_path / NAME, at)
@@ -259,7 +252,7 @@ def test_a_checkpoint_is_on_disk_before_it_is_listed_and_listed_before_it_has_it
     def check(old: Path, new: Path) -> None:
         if Path(new) == tmp_path / "1":
             missing.append([path.name for path in (old, *old.rglob("*")) if path.stat().st_ino not in synced])
-            assert verify(old)
+            verify(old)
             synced.clear()
         replace(old, new)
 

@@ -1,4 +1,4 @@
-"""Runs on disk: those of earlier versions, what may differ between starts, and models for inference."""
+"""Runs on disk: what came later, what may differ between starts, and models for inference."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pickle
 import shutil
 import subprocess
 import sys
-import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,29 +27,14 @@ from hma_jax.training import reading, runs
 from hma_jax.training.branch import branch
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.hashes import NAME, ReadError
-from hma_jax.training.loop import LoopOptions
 from hma_jax.training.reading import CheckpointError, read_description
 from hma_jax.training.runs import describe_run, load_model, load_run, modernise, read_configs
 from hma_jax.training.train import train_model
 from tests.hma_jax.test_training import equal_trees
 from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, lively_params, model_config, train_config
 
-OLD = Path(__file__).parent / "data" / "run_3caafdd.tar.gz"
 MODEL = model_config(**SMALLER)
-OLD_LOSSES = [
-    2.7726471424102783, 2.7733123302459717, 2.7752277851104736, 2.7715091705322266, 2.774799108505249,
-    2.7706916332244873,
-]  # fmt: skip
-"""Of six steps by that version."""
-
 AVERAGED = train_config(steps=2, batch=4, ema_decay=0.2)
-
-
-@pytest.fixture
-def old_run(tmp_path: Path) -> Path:
-    with tarfile.open(OLD) as archive:
-        archive.extractall(tmp_path / "old", filter="data")
-    return tmp_path / "old"
 
 
 @pytest.fixture(scope="module")
@@ -170,32 +154,13 @@ def test_several_processes_read_the_step_that_process_0_sees_and_another_one_tog
     assert load_run(tmp_path / "run").step == 4
 
 
-# --- Earlier versions ------------------------------------------------------------------------
-
-
-def test_a_run_of_an_earlier_version_loads(old_run: Path):
-    run = load_run(old_run)
-    assert run.model == MODEL and run.table == TABLE and run.step == 4
-    assert run.train == train_config(steps=4, batch=4)
-    assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(run.params))
-
-
-def test_a_run_of_an_earlier_version_goes_on_where_it_would_have(old_run: Path):
-    """It was computed with other remat, attention and accumulation: rounding may differ, and nothing else."""
-    result = train_model(
-        MODEL, TABLE, train_config(steps=6, batch=4), batches(MODEL, 4),
-        run_dir=old_run, provenance={"data": "random"}, options=LoopOptions(checkpoint_every=1),
-    )  # fmt: skip
-    assert result.resumed_from == 4
-    np.testing.assert_allclose(result.losses, OLD_LOSSES, rtol=1e-5)
-    assert load_run(old_run).step == 6
+# --- Fields that came later ------------------------------------------------------------------
 
 
 def test_a_field_that_came_later_takes_its_default_and_an_unknown_one_is_named():
     today = describe_run(MODEL, AVERAGED, TABLE, {})
     earlier = json.loads(json.dumps(today))
     del earlier["train"]["ema_decay"], earlier["model"]["mup"]["without"]
-    earlier["model"]["compute_dtype"], earlier["train"]["accumulate"] = "bfloat16", 4
     assert modernise(earlier) == describe_run(MODEL, replace(AVERAGED, ema_decay=0.0), TABLE, {})
     assert modernise(today) == today
     earlier["model"]["telepathy"] = True
@@ -234,15 +199,16 @@ def test_a_run_is_read_into_memory_of_the_host(averaged):
     assert all(isinstance(x, np.ndarray) for x in jax.tree.leaves(run.params))
 
 
-def test_which_weights_are_read_is_said_and_can_be_chosen(averaged, old_run: Path):
+def test_which_weights_are_read_is_said_and_can_be_chosen(averaged, tmp_path: Path):
     run_dir, state = averaged
+    train_model(MODEL, TABLE, replace(AVERAGED, ema_decay=0.0), batches(MODEL, 4), run_dir=tmp_path, provenance={})
     assert not equal_trees(state.ema, state.params)
     for weights, want, which in (("last", "params", "last"), ("ema", "ema", "ema"), ("auto", "ema", "ema")):
         run = load_run(run_dir, weights)
         assert run.weights == which and equal_trees(run.params, getattr(state, want))
-    assert load_run(old_run, "auto").weights == "last"
+    assert load_run(tmp_path, "auto").weights == "last"
     with pytest.raises(ConfigError, match="keeps no average of its weights"):
-        load_run(old_run, "ema")
+        load_run(tmp_path, "ema")
     with pytest.raises(ConfigError, match="weights: 'newest' is not allowed; choose one of auto, last, ema"):
         load_run(run_dir, "newest")  # gave the average
 

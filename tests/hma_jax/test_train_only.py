@@ -1,6 +1,5 @@
 """Runs that train some robots' own parameters alone hold moments of these alone."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -11,18 +10,14 @@ import pytest
 
 from hma_jax.config import ConfigError, OptimizerConfig
 from hma_jax.config.training import Matrices
-from hma_jax.model.hma import declare_model
-from hma_jax.model.params import is_spec
 from hma_jax.training import train_only
 from hma_jax.training.branch import begin_from
-from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.loop import LoopOptions
-from hma_jax.training.reading import load_items, on_host, read_description
-from hma_jax.training.state import TrainState, init_state, state_shapes
+from hma_jax.training.state import init_state, state_shapes
 from hma_jax.training.step import make_train_step
 from tests.hma_jax.test_robots import DECLARED, MODEL, OWN, SIX
 from tests.hma_jax.test_training import equal_trees, train
-from tests.tiny import TABLE, random_batch, train_config
+from tests.tiny import random_batch, train_config
 
 FREE = OptimizerConfig(learning_rate=1e-2, warmup_steps=1, weight_decay=0.1, clip_norm=1e9)
 ONLY = train_config(only=("arm",))
@@ -80,57 +75,8 @@ def test_robots_to_train_that_there_are_not_are_named():
         make_train_step(DECLARED, SIX, MODEL, train_config(only=("arm", "walker")))
 
 
-def as_before(state: TrainState) -> TrainState:
-    """As versions saved it that had moments of everything: 0 of what is frozen."""
-    specs, whole = declare_model(MODEL, TABLE).specs, jax.tree.map(np.zeros_like, state.params)
-    place = TABLE.index("arm")
-
-    def widened(moment):
-        def one(spec, x):
-            slices = [np.zeros_like(x)] * TABLE.size
-            slices[place] = np.asarray(x)
-            return np.concatenate(slices, axis=spec.embodiment_axis)
-
-        return train_only.put_own(whole, jax.tree.map(one, train_only.pick_own(specs, specs), moment, is_leaf=is_spec))
-
-    adam = state.opt_state
-    return state._replace(opt_state=adam._replace(first=widened(adam.first), second=widened(adam.second)))
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> tuple[TrainState, Path]:
-    """(a run's last state, the run after two steps as an earlier version would have written it)."""
-    root = tmp_path_factory.mktemp("only")
-    options = LoopOptions(checkpoint_every=2, keep_checkpoints=3)
-    last = train(root / "whole", config=ONLY, options=options).state
-    begin_from(root / "whole", root / "former", 2)
-    checkpoints = root / "former" / "checkpoints"
-    shapes = state_shapes(declare_model(MODEL, TABLE), TABLE, only=ONLY.only)._asdict()
-    few = load_items(checkpoints / "2", on_host({name: item for name, item in shapes.items() if item is not None}))
-    description = read_description(checkpoints / "2")
-    shutil.rmtree(checkpoints)
-    with Checkpoints(checkpoints, description) as written:
-        written.save(2, as_before(TrainState(**few)))
-    return last, root / "former"
-
-
-def test_a_run_of_an_earlier_version_which_held_moments_of_everything_goes_on_as_if_it_had_not(run, tmp_path: Path):
-    last, former = run
-    shutil.copytree(former, tmp_path / "run")
+def test_a_run_that_trains_some_robots_alone_resumes_exactly(tmp_path: Path):
+    last = train(tmp_path / "whole", config=ONLY, options=LoopOptions(checkpoint_every=2, keep_checkpoints=3)).state
+    begin_from(tmp_path / "whole", tmp_path / "run", 2)
     resumed = train(tmp_path / "run", config=ONLY)
     assert resumed.resumed_from == 2 and equal_trees(resumed.state, last)
-
-
-def test_a_run_begun_from_a_checkpoint_of_an_earlier_version_is_the_same(run, tmp_path: Path):
-    last, former = run
-    assert begin_from(former, tmp_path / "run", 4) == 2
-    assert equal_trees(train(tmp_path / "run", config=ONLY).state, last)
-
-
-def test_damaged_moments_of_an_earlier_version_are_named(run, tmp_path: Path):
-    shutil.copytree(run[1], tmp_path / "run")
-    for path in (tmp_path / "run" / "checkpoints" / "2" / "opt_state").rglob("*"):
-        if path.is_file() and path.name[0] != "_":
-            path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(ConfigError, match="the checkpoint .* is damaged: opt_state/"):
-        train(tmp_path / "run", config=ONLY)

@@ -223,6 +223,5 @@ def episode_seed(seed: int, origin: str) -> int:
 
 
 def checkpoint_hash(run: Path, step: int) -> str:
-    """The hash of all files of a run's checkpoint, as listed beside them; "" for one of a version that made no list."""
-    path = run / CHECKPOINTS / str(step) / HASHES
-    return str(json.loads(path.read_text())["sha256"]) if path.exists() else ""
+    """The hash of all files of a run's checkpoint, as listed beside them."""
+    return str(json.loads((run / CHECKPOINTS / str(step) / HASHES).read_text())["sha256"])

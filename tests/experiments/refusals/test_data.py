@@ -251,7 +251,7 @@ def test_so_are_those_of_data_that_replace_others_of_which_windows_are_there(tmp
     arm = write_rlds(tmp_path / "rlds", ARM, LENGTHS)
     monkeypatch.setattr(tokenizer_training, "train_tokenizer", lambda *_, **__: require(False, "it would be trained"))
     monkeypatch.setattr(registry_table, "_registered", {ARM.name: replace(ARM, mean_steps=8.0)})
-    Workspace(tmp_path).manifest.write_text("{}")  # of an earlier version, say
+    Workspace(tmp_path).manifest.write_text("{}")
     assert main(["tokenize", *SMOKE, "--out", str(tmp_path), "--data", str(arm), "--replace", "tokenizer"]) == 2
     said = capsys.readouterr()
     assert "it would be trained" in said.err and f"{ARM.name} (about 8 steps an episode; 9 are needed)" in said.out
