@@ -112,7 +112,7 @@ def test_a_file_that_cannot_be_read_now_is_not_taken_for_damaged(name: str, run_
         return real(file, *arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(hashes, "open", fail, raising=False)
+        patch.setattr(Path, "open", fail)
         patch.setattr(Path, "read_text", lambda self, *_: fail(self).read())
         with pytest.raises(ReadError, match=f"{path} cannot be read now .Too many open files.*same command again"):
             fit_toy(run_dir, 8, options=SKIP)
