@@ -25,16 +25,17 @@ ROOT = Path(__file__).parents[3]
 RESULTS = ROOT / "experiments" / "results"
 
 
-def from_settings(kind: type, path: Path, model: Path = FIRST):
+def from_settings(kind: type, path: Path, model: Path | None = FIRST):
+    """`model`: None for one that is not in this repository."""
     values = json.loads(path.read_text())
-    assert values.pop("run") == model.name
-    assert values.pop("weights") == hash_of(load_model(model).params)
+    run, weights = values.pop("run"), values.pop("weights")
+    assert not model or (run, weights) == (model.name, hash_of(load_model(model).params))
     values.pop("simulator", None)  # files that were written before it was kept lack it
     assert set(values) <= {f.name for f in fields(kind)}  # nor do they have fields that came later
     return from_dict(kind, values)
 
 
-def summary_of(name: str, model: Path) -> list[conditions.Summary]:
+def summary_of(name: str, model: Path | None) -> list[conditions.Summary]:
     """Of committed trials, which `name`/table.md shows."""
     place = RESULTS / name
     settings, trials = from_settings(Settings, place / "settings.json", model), conditions.read_trials(place)
@@ -62,6 +63,10 @@ NIGHT = {
     "grown_night_two": DRIVEN,
     "grown_night_through": DRIVEN,
 }
+
+
+TUNED = ("tuned_night", "tuned_night_two")
+"""Of a model that was trained further on the robot."""
 
 
 def page() -> str:
@@ -133,6 +138,22 @@ def test_what_the_served_model_s_trajectories_are_worth_is_as_the_page_says():
 def test_what_trajectories_are_worth_that_outlast_their_recorded_frames_is_as_the_page_says(what):
     ways = [summary_of(name, model) for name, model in NIGHT.items()]
     assert side_by_side(ways, what) in (ROOT / "docs" / "generating.md").read_text()
+
+
+@pytest.mark.parametrize("what", ["success", "error"])
+def test_what_trajectories_are_worth_of_a_model_that_was_trained_further_is_as_the_page_says(what):
+    assert (
+        side_by_side([summary_of(name, None) for name in TUNED], what) in (ROOT / "docs" / "generating.md").read_text()
+    )
+    one, two = (worth(name, GIVEN) for name in TUNED)
+    assert f"The generated frames are worth {one} of success after one recorded frame and {two} after two" in page()
+
+
+def test_a_model_is_compared_with_what_it_was_trained_further_from_under_one_protocol():
+    for before, after in zip(("grown_night", "grown_night_two"), TUNED, strict=True):
+        one, other = (json.loads((RESULTS / name / "settings.json").read_text()) for name in (before, after))
+        assert one.pop("simulator")["decode"] == other.pop("simulator")["decode"]
+        assert {name for name, x in one.items() if other[name] != x} == {"run", "weights"}
 
 
 def test_models_are_compared_under_one_protocol():
