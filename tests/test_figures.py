@@ -186,12 +186,23 @@ def test_policies_and_plans_are_as_readme_says():
         (cells,) = (cells for label, cells in rows.items() if label.startswith(said))
         assert len(judged["policies"]) == policies
         assert cells[0] == f"r = {learned['mean']:.2f} ({learned['low']:.2f} to {learned['high']:.2f})"
-        assert cells[1].partition(",")[0] == f"given other actions: {control['mean']:.2f}"
+        assert cells[1].partition(",")[0] == f"other actions: {control['mean']:.2f}"
     learned, _ = correlations("metaworld_drawer-without_actions")
     assert cells[1].endswith("; trained without actions: undefined") and learned["mean"] is None
     (cells,) = (cells for label, cells in rows.items() if label.startswith("goals reached by MPPI"))
     said = f"behaviour cloning, mean of sixteen: {100 * cloned().mean():.0f} %"
     assert cells == [f"{100 * planned_by_mppi().mean():.0f} %", said] and len(cloned()) == 16
+
+
+def test_generated_trajectories_are_worth_what_readme_says():
+    with (ROOT / "experiments/results/tuned_night_two/summary.csv").open(newline="") as file:
+        found = {
+            row["what"]: [round(100 * float(row[x])) for x in ("mean", "low", "high")] for row in csv.DictReader(file)
+        }
+    mean, low, high = found["success: share of the gap: 10 + 90 generated"]
+    alone = found["success: share of the gap: recorded first frames only"][0]
+    (cells,) = (cells for label, cells in table(README, "| | model |").items() if "90 generated trajectories" in label)
+    assert cells == [f"{mean} % ({low} to {high}) of the gap to 100", f"recorded first frames alone: {alone} %"]
 
 
 def correlations(task: str) -> list[dict[str, float | None]]:
