@@ -441,7 +441,7 @@ def test_the_reference_on_latents_is_as_its_findings_say():
     assert f"{gain:.2f} dB ahead of copying" in page and f"ΔPSNR beyond 3 on {beyond} of the 36" in page
     (psnr,) = curve(rows_of(study), "horizon", "psnr")
     ids = next(p for p in curve(rows_of(), "horizon", "psnr") if p.x == psnr.x)
-    said = "| three seeds of {:,.0f} steps: {:.2f} dB, ids {:.2f} by another recipe; not decided ("
+    said = "| three seeds of {:,.0f} steps: {:.2f} dB, ids {:.2f} by another recipe; undecided ("
     assert said.format(psnr.x, psnr.mean, ids.mean) in readme() and len(psnr.seeds) == len(ids.seeds) == 3
     for e in read_expected(RESULTS / study / "predictions" / FILE):
         (point,) = curve(rows_of(study), "horizon", e.metric)
