@@ -62,9 +62,9 @@ def read_stamp(directory: Path, name: str = STAMP) -> MadeFrom | None:
     try:
         existing = from_dict(MadeFrom, json.loads((directory / name).read_text()))
         require(all(isinstance(part, dict) for part in vars(existing).values()), "not JSON values by name")
+        return existing
     except (OSError, ValueError):  # ConfigError is a ValueError
         return None
-    return existing
 
 
 def differences(existing: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:

@@ -126,7 +126,6 @@ def train_trial(
     store, loader = prepared.store, loader_of(trial)
     table = table or training_table(store, loader, trial.train.action_scale)
     checkpoint_every, validate_every = options.steps_between(trial.train.steps)
-    lost = {"lost": {name: store.manifest(name).skipped_count for name in trial.datasets}}  # damaged episodes, left out
 
     def report(step: int, steps: int, values: dict[str, float]) -> None:
         held_out = f", held-out loss {values['validation/loss']:.4f}" if "validation/loss" in values else ""
@@ -150,7 +149,7 @@ def train_trial(
             "store": store.hash(trial.datasets),
             "tokenizer": prepared.tokenizer.identity,
             "loader": identity_of(loader),
-            **lost,
+            "lost": {name: store.manifest(name).skipped_count for name in trial.datasets},  # damaged episodes, left out
             **({"origin": origin} if origin else {}),
         },
         initial=initial,
